@@ -1,0 +1,1 @@
+"""Models: parameters to geometry and to pinocchio models."""

@@ -1,0 +1,61 @@
+"""Physical words for what a motion did and did not show of a grasp."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from factorgrasp.recordings import PoseStream
+from factorgrasp.typing import FloatArray
+
+# Rates whose second principal axis carries less than this part of the power turn about one axis only.
+_ONE_AXIS = 0.02
+_ALIGNED = 0.9
+
+
+def rotation_axis(rate_moment: FloatArray) -> tuple[FloatArray, float]:
+    """Principal axis (3,) of the end-effector's rotation, and the power of the second axis relative to the first."""
+    values, vectors = np.linalg.eigh(rate_moment)
+    return np.asarray(vectors[:, 2]), float(values[1] / values[2]) if values[2] > 0.0 else 1.0
+
+
+def axis_words(vector: FloatArray) -> str:
+    """A direction in its frame, e.g. "(0.22, 0.87, 0.44)" or "z"."""
+    largest = int(np.argmax(np.abs(vector)))
+    if abs(vector[largest]) > 0.97:
+        return "xyz"[largest]
+    return "(" + ", ".join(f"{v:.2f}" for v in vector) + ")"
+
+
+def direction(variable: str, vector: FloatArray, rate_moment: FloatArray) -> str:
+    """Words for a unit direction of the rotation (hand frame) or the lever arm (end-effector frame)."""
+    if variable == "rotation":
+        return f"rotation about hand axis {axis_words(vector)}"
+    axis, second = rotation_axis(rate_moment)
+    along = abs(float(axis @ vector))
+    words = f"lever arm along end-effector axis {axis_words(vector)}"
+    if second < _ONE_AXIS and along > _ALIGNED:
+        return words + ", which is the rotation axis"
+    return words
+
+
+def advice(rate_moment: FloatArray, robot: object) -> str:
+    """What would inform the missing directions."""
+    _, second = rotation_axis(rate_moment)
+    speed = float(np.sqrt(max(np.trace(rate_moment), 0.0)))
+    if speed < 0.05:
+        return (
+            f"The end-effector hardly rotates ({np.degrees(speed):.2g} deg/s rms): only a rotation shows the lever arm. "
+            "Rotate the object about at least two axes, some tens of deg/s."
+        )
+    if second < _ONE_AXIS:
+        return (
+            "The end-effector rotates about one axis only, and a lever arm along that axis moves nothing. "
+            "Add rotation about a second axis (a conical motion, or two rotations one after the other)."
+        )
+    words = (
+        f"The rotation ({np.degrees(speed):.2g} deg/s rms) is too weak or too slow for the noise in the acceleration: "
+        "rotate faster or longer, about changing axes."
+    )
+    if isinstance(robot, PoseStream) and robot.rate < 200.0:
+        words += " Poses sampled or interpolated from few samples a second carry no acceleration: record the robot side faster."
+    return words
