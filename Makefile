@@ -66,7 +66,7 @@ $(BIN)/python:
 
 # setuptools first, so that the package is built with the version of constraints.txt too.
 $(RUNTIME): pyproject.toml constraints.txt | $(BIN)/python
-	@echo "== setting up: factorgrasp and what it needs, into $(VENV) (about 200 MB of downloads the first time)"
+	@echo "== setting up: factorgrasp and what it needs, into $(VENV) (the first time it downloads them)"
 	$(INSTALL) setuptools
 	$(INSTALL) --no-build-isolation --editable .
 	@touch $@

@@ -30,7 +30,10 @@ from factorgrasp.status import Status
 from factorgrasp.tables import Column, Table, log10_summary, shifted_geometric_mean
 
 TOLERANCES = {"low": 1e-3, "mid": 1e-6, "high": 1e-9}
-SETS = {"qp_maros_small": "Maros-Meszaros, 26 small problems", "qp_mpc": "model predictive control, 12 problems"}
+SETS = {
+    "qp_maros_small": "Maros-Meszaros, 26 small problems",
+    "qp_mpc": "model predictive control, 12 problems",
+}
 INFINITE = 9e19
 
 LIMITATIONS = (
@@ -39,7 +42,7 @@ LIMITATIONS = (
     "All problems are feasible and bounded: nothing is said on how infeasible ones are found out.",
     "ECOS and quadprog take positive definite problems only and say so on others: these count as failed for them.",
     "HiGHS runs without its own regularisation (qp_regularization_value = 0) and takes no tolerance below 1e-10.",
-    "OSQP, SCS, QPALM, ProxQP and all others keep their own iteration limits; only the tolerances are set. No parameter is tuned.",
+    "All backends keep their own iteration limits; only the tolerances are set. No parameter is tuned.",
     "Relative tolerances are zero here. In the library they are 1e-12, so that badly scaled problems can end.",
     "Published objectives have 9 digits: differences below 1e-8 mean nothing.",
     "Warm means: the same values again, from the last solution. A stream of changing values gains less.",
@@ -59,7 +62,9 @@ class Case:
 def cases(folder: Path) -> Iterator[Case]:
     """The problems below a data folder."""
     for collection in SETS:
-        answers = json.loads((folder / collection / "ANSWERS_reference_objectives.json").read_text(encoding="utf-8"))
+        answers = json.loads(
+            (folder / collection / "ANSWERS_reference_objectives.json").read_text(encoding="utf-8")
+        )
         for path in sorted((folder / collection).glob("*.[mn][ap][tz]")):
             answer = answers[path.stem]
             reference = answer["published"] if answer["published"] is not None else answer["consensus"]
@@ -110,8 +115,8 @@ def read_mpc(path: Path) -> QuadraticProgram:
 
 
 def strict_options(backend: str, tolerance: float, time_limit: float) -> SolverOptions:
-    """One absolute tolerance and no relative one."""
-    extra = dict.fromkeys(KEYWORDS[backend].relative, 0.0)
+    """One absolute tolerance and no relative one (ECOS insists on a number above zero)."""
+    extra = dict.fromkeys(KEYWORDS[backend].relative, 1e-16 if backend == "ecos" else 0.0)
     return SolverOptions(tolerance=tolerance, time_limit=time_limit, extra=extra)
 
 
@@ -134,7 +139,8 @@ def run(case: Case, backend: str, tolerance: float, repeat: int, time_limit: flo
         "tolerance": tolerance,
         "status": found.status.value,
         "success": claim and within,
-        "correct": claim == within,
+        # All problems here have a solution: that one is infeasible or unbounded is a false claim.
+        "correct": claim == within and found.status not in (Status.INFEASIBLE, Status.UNBOUNDED),
         "objective": objective(case, found),
         "objective_difference": abs(objective(case, found) - case.reference) / max(1.0, abs(case.reference)),
         "primal": certificate.primal,
@@ -161,7 +167,10 @@ def summarize(rows: list[dict[str, Any]], time_limit: float) -> Iterator[Table]:
     for collection, words in SETS.items():
         for level, tolerance in TOLERANCES.items():
             chosen = [row for row in rows if row["set"] == collection and row["tolerance"] == tolerance]
-            lines = [summary_line(backend, [row for row in chosen if row["solver"] == backend], time_limit) for backend in dict.fromkeys(row["solver"] for row in chosen)]
+            lines = [
+                summary_line(backend, [row for row in chosen if row["solver"] == backend], time_limit)
+                for backend in dict.fromkeys(row["solver"] for row in chosen)
+            ]
             lines.sort(key=lambda line: (-line["success"], line["cold"]))
             yield Table(COLUMNS, tuple(lines), f"{words}; {level} tolerance {tolerance:g}")
 
@@ -214,11 +223,12 @@ def report(tables: list[Table], parameters: dict[str, str], where: dict[str, str
     lines += [f"- {key}: {value}" for key, value in {**where, **parameters}.items()]
     lines += ["", "## How to read", ""]
     lines += [
-        "- success: claims to have solved it and all of primal residual, dual residual and duality gap (ours) are within the tolerance.",
-        "- correct: the claim agrees with that check, be it solved or not.",
+        "- success: claims to have solved it, and primal residual, dual residual and duality gap (ours) are within the tolerance.",
+        "- correct: the claim agrees with that check, be it solved or not; that a problem is infeasible or unbounded is false here.",
         "- set-up, solve: medians over the problems solved.",
         "- cold*, warm*: shifted geometric means over all problems (shift 1 ms); one that was not solved counts as the time limit.",
-        "- log10 columns: median / maximum over the problems that it claims to have solved; objective: difference to the reference, relative above 1.",
+        "- log10 columns: median / maximum over the problems that it claims to have solved.",
+        "- objective: difference to the reference objective, relative where that is above 1.",
         "",
         "## Limitations",
         "",
@@ -230,40 +240,59 @@ def report(tables: list[Table], parameters: dict[str, str], where: dict[str, str
 
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     default = os.environ.get("FACTORGRASP_DATA", "../shared/data")
-    parser.add_argument("--data", type=Path, default=Path(default), help="folder with qp_maros_small and qp_mpc")
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results", help="folder for the results")
+    parser.add_argument(
+        "--data", type=Path, default=Path(default), help="folder with qp_maros_small and qp_mpc"
+    )
+    parser.add_argument(
+        "--out", type=Path, default=Path(__file__).parent / "results", help="folder for the results"
+    )
     parser.add_argument("--solvers", default="", help="names, comma-separated; all installed ones by default")
     parser.add_argument("--repeat", type=int, default=5, help="repeats of every measurement")
-    parser.add_argument("--time-limit", type=float, default=10.0, help="seconds a solve, and the price of a failure")
+    parser.add_argument(
+        "--time-limit", type=float, default=10.0, help="seconds a solve, and the price of a failure"
+    )
     return parser.parse_args(arguments)
 
 
 def main(arguments: list[str] | None = None, say: Callable[[str], None] = print) -> None:
     """Run all and write ``solver_benchmark.{md,csv,json}``."""
     chosen = parse(arguments)
-    names = chosen.solvers.split(",") if chosen.solvers else [n for n in MODULES if solver_class(n).installed()]
+    names = (
+        chosen.solvers.split(",") if chosen.solvers else [n for n in MODULES if solver_class(n).installed()]
+    )
     problems = list(cases(chosen.data))
     rows: list[dict[str, Any]] = []
     for backend in names:
         for tolerance in TOLERANCES.values():
             rows += [run(case, backend, tolerance, chosen.repeat, chosen.time_limit) for case in problems]
-        say(f"{backend}: {sum(row['success'] for row in rows if row['solver'] == backend)} of {3 * len(problems)}")
+        say(
+            f"{backend}: {sum(row['success'] for row in rows if row['solver'] == backend)} of {3 * len(problems)}"
+        )
     parameters = {
         "tolerances": ", ".join(f"{level} {value:g}" for level, value in TOLERANCES.items()),
         "relative tolerances": "0",
         "repeats": str(chosen.repeat),
         "time limit": f"{chosen.time_limit:g} s",
     }
-    where = environment(["factorgrasp", "numpy", "scipy", "qpsolvers", *(MODULES[n][1].split()[-1] for n in names)])
+    where = environment(
+        ["factorgrasp", "numpy", "scipy", "qpsolvers", *(MODULES[n][1].split()[-1] for n in names)]
+    )
     tables = list(summarize(rows, chosen.time_limit))
     page = report(tables, parameters, where)
     say(page)
     from factorgrasp.atomic import write_text
 
     write_text(chosen.out / "solver_benchmark.md", page)
-    every = Table(tuple(Column(key) for key in rows[0]), tuple(rows), "QP solvers", tuple(f"{k}: {v}" for k, v in {**where, **parameters}.items()))
+    every = Table(
+        tuple(Column(key) for key in rows[0]),
+        tuple(rows),
+        "QP solvers",
+        tuple(f"{k}: {v}" for k, v in {**where, **parameters}.items()),
+    )
     every.write(chosen.out / "solver_benchmark.csv")
     every.write(chosen.out / "solver_benchmark.json")
 

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import sys
 import traceback
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
@@ -20,6 +22,7 @@ from factorgrasp.errors import FactorgraspError, InputError, NotSolvedError
 
 if TYPE_CHECKING:
     from factorgrasp.solvers.base import Capabilities
+    from factorgrasp.solvers.compare import Comparison
 
 SOLVED, NOT_SOLVED, BAD_INPUT, DEFECT = 0, 1, 2, 3
 
@@ -72,9 +75,8 @@ def main() -> NoReturn:
     """Entry point of the command; ends the process with its exit code."""
     try:
         app()
-    except (
-        Exception
-    ):  # whatever is not a mistake of the user's is one of ours, and must not look like "not solved"
+    except Exception:
+        # What is not a mistake of the user's is one of ours, and must not look like "not solved".
         traceback.print_exc()
         _err.print("factorgrasp: this is a defect; please report it with the lines above")
         sys.exit(DEFECT)
@@ -134,6 +136,7 @@ def demo_command(
         _out.print(f"$ factorgrasp solve {file} --out {out}\n")
         estimate = _solve(file, None, out)
         _out.print("\n" + truth_table(estimate, out).text())
+        _out.print(f"open {out / 'report.html'} in a browser")
         _finish(estimate)
 
 
@@ -144,13 +147,60 @@ def compare_command(
         str | None,
         typer.Option(
             metavar="A,B,...",
-            help="Names from `factorgrasp solvers`. \\[default: all that fit]",
+            help="Names from `factorgrasp solvers`. \\[default: all that are installed]",
             show_default=False,
         ),
     ] = None,
-    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Also write comparison.json there.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR", help="Also write comparison.json, .csv and .md there.", show_default=False
+        ),
+    ] = None,
 ) -> None:
-    """Solve problem files with several solvers, and compare accuracy and time."""
+    """Solve problem files with several solvers, and compare claims, accuracy and time."""
+    with _exit_codes():
+        if out is not None:
+            _check_folder(out)
+        comparison = _compare(files, None if solvers is None else _names(solvers))
+        _out.print(comparison.text())
+        if len(files) > 1:
+            _out.print("\n" + comparison.summary().text())
+        if out is not None:
+            from factorgrasp.results import write_comparison
+
+            _out.print("\n" + "\n".join(f"wrote {path}" for path in write_comparison(comparison, out)))
+        solved = {row.problem for row in comparison.rows if row.status == "solved"}
+        unsolved = [str(file) for file in files if str(file) not in solved]
+        if unsolved:
+            _err.print(f"not solved by any solver: {', '.join(unsolved)}")
+            raise typer.Exit(NOT_SOLVED)
+
+
+def _compare(files: list[Path], solvers: list[str] | None) -> Comparison:
+    """Compare file by file, so that one can see how far it is."""
+    from factorgrasp import compare
+    from factorgrasp.problem_file import load_problem
+    from factorgrasp.solvers.registry import solver_class
+
+    for name in solvers or ():
+        solver_class(name)
+    stated = []
+    for file in files:
+        with _working(f"reading {file}"):
+            stated.append(load_problem(file))
+    parts = []
+    for number, each in enumerate(stated, start=1):
+        with _working(f"comparing solvers on {each.path} ({number} of {len(stated)})"):
+            parts.append(compare({str(each.path): each.problem}, solvers))
+    return replace(parts[0], rows=tuple(row for part in parts for row in part.rows))
+
+
+def _names(text: str) -> list[str]:
+    names = [name.strip() for name in text.split(",") if name.strip()]
+    if not names:
+        raise InputError("--solvers", "names of solvers with commas between them", repr(text))
+    return names
 
 
 @app.command("solvers")
@@ -189,12 +239,17 @@ def _solve(file: Path, solver: str | None, out: Path) -> Any:
     from factorgrasp.results import write_all
 
     _check_folder(out)
-    with _working(f"reading {file}"):
-        stated = load_problem(file)
-    with _working("solving"):
-        estimate = solve(stated.problem, solver=solver or stated.solver)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", UserWarning)
+        with _working(f"reading {file}"):
+            stated = load_problem(file)
+        with _working("solving"):
+            estimate = solve(stated.problem, solver=solver or stated.solver)
+    remarks = list(dict.fromkeys(str(warning.message) for warning in caught))
+    for remark in remarks:
+        _err.print(f"warning: {remark}")
     with _working(f"writing the report into {out}"):
-        written = write_all(estimate, out, title=stated.title, source=str(file))
+        written = write_all(estimate, out, title=stated.title, source=str(file), remarks=remarks)
     _out.print(estimate.summary())
     _out.print("\n" + "\n".join(f"wrote {path}" for path in written))
     return estimate

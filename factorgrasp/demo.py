@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,10 +10,11 @@ import numpy as np
 
 from factorgrasp import lie
 from factorgrasp.problems.grasp_estimate import GraspPoseEstimate
-from factorgrasp.report import quantity
+from factorgrasp.report import decimals
 from factorgrasp.simulation.cehajic2015 import ENCODER_POSES, XSENS, cehajic2015
 from factorgrasp.simulation.grasp_files import write_recording
 from factorgrasp.tables import Column, Table
+from factorgrasp.typing import FloatArray
 
 TIME_OFFSET = 0.034
 """By how much the hand's clock is ahead (s)."""
@@ -60,49 +60,56 @@ def truth_table(estimate: GraspPoseEstimate, directory: Path) -> Table:
     """
     truth = json.loads((directory / "truth.json").read_text(encoding="utf-8"))
     sd = np.sqrt(np.diag(estimate.covariance))
-    rotation_error = lie.so3_log(estimate.rotation.T @ lie.quaternion_wxyz_to_matrix(truth["rotation_wxyz"]))
-    rows = _rows("position", "m", truth["translation"], estimate.translation, sd[3:])
-    rows += [
-        {
-            "what": f"rotation about {axis}",
-            "error": quantity(float(e), "rad"),
-            "sd": quantity(float(s), "rad"),
-        }
-        for axis, e, s in zip("xyz", rotation_error, sd[:3], strict=True)
+    turn = np.degrees(
+        lie.so3_log(estimate.rotation.T @ lie.quaternion_wxyz_to_matrix(truth["rotation_wxyz"]))
+    )
+    gyro_bias, force_bias = np.array(truth["gyro_bias"]), np.array(truth["accelerometer_bias"])
+    offset = (
+        np.array([truth["time_offset"]]),
+        np.array([estimate.time_offset]),
+        np.array([estimate.time_offset_sd]),
+    )
+    deg = 180.0 / np.pi
+    rows = [
+        *_rows("position", "mm", 1e3, np.array(truth["translation"]), estimate.translation, sd[3:]),
+        *_rows("rotation about", "deg", 1.0, np.full(3, np.nan), turn, deg * sd[:3]),
+        *_rows("clock offset", "ms", 1e3, *offset),
+        *_rows("gyroscope bias", "deg/s", deg, gyro_bias, estimate.gyro_bias, estimate.gyro_bias_sd),
+        *_rows(
+            "accelerometer bias",
+            "mm/s²",
+            1e3,
+            force_bias,
+            estimate.accelerometer_bias,
+            estimate.accelerometer_bias_sd,
+        ),
     ]
-    rows += _rows(
-        "clock offset", "s", [truth["time_offset"]], [estimate.time_offset], [estimate.time_offset_sd]
-    )
-    rows += _rows("gyroscope bias", "rad/s", truth["gyro_bias"], estimate.gyro_bias, estimate.gyro_bias_sd)
-    rows += _rows(
-        "accelerometer bias",
-        "m/s^2",
-        truth["accelerometer_bias"],
-        estimate.accelerometer_bias,
-        estimate.accelerometer_bias_sd,
-    )
-    columns = (
-        Column("what", "beside the truth"),
-        Column("truth"),
-        Column("estimate"),
-        Column("error"),
-        Column("sd", "claimed sd"),
+    columns = tuple(
+        Column(key, header)
+        for key, header in (
+            ("what", "beside the truth"),
+            ("unit", "unit"),
+            ("truth", "truth"),
+            ("estimate", "estimate"),
+            ("error", "error"),
+            ("sd", "claimed sd"),
+        )
     )
     return Table(columns, tuple(rows))
 
 
 def _rows(
-    what: str, unit: str, truth: Iterable[float], estimate: Iterable[float], sd: Iterable[float]
+    what: str, unit: str, scale: float, truth: FloatArray, estimate: FloatArray, sd: FloatArray
 ) -> list[dict[str, str]]:
-    found = list(zip(truth, estimate, sd, strict=True))
-    names = [f"{what} {axis}" for axis in "xyz"] if len(found) == 3 else [what]
-    return [
-        {
-            "what": name,
-            "truth": quantity(float(true), unit, 4),
-            "estimate": quantity(float(value), unit, 4),
-            "error": quantity(float(value - true), unit),
-            "sd": quantity(float(spread), unit),
-        }
-        for name, (true, value, spread) in zip(names, found, strict=True)
-    ]
+    """One row a component, all figures to the second digit of the standard deviation; a truth of NaN: `estimate` is the error itself."""
+    names = [f"{what} {axis}" for axis in "xyz"] if truth.size == 3 else [what]
+    out = []
+    for name, true, value, spread in zip(names, scale * truth, scale * estimate, scale * sd, strict=True):
+        digits = decimals(float(spread))
+        # Adding zero turns -0.0 into 0.0.
+        error = np.round(value if np.isnan(true) else value - true, digits) + 0.0
+        row = {"what": name, "unit": unit, "error": f"{error:+.{digits}f}", "sd": f"{spread:.{digits}f}"}
+        if not np.isnan(true):
+            row |= {"truth": f"{true:.{digits}f}", "estimate": f"{value:.{digits}f}"}
+        out.append(row)
+    return out

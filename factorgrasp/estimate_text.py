@@ -49,7 +49,7 @@ def _values(estimate: Estimate) -> list[str]:
                 (label, f"{value:.6g}", "" if np.isnan(spread) else f"+- {_short(spread)}", variable.unit)
             )
     shown = rows[:MOST_ROWS]
-    lines = _align([("", "value", "sd", "unit"), *shown], "<>><")
+    lines = _align([("", "value", "sd", "unit"), *shown], "<><<")
     if len(rows) > len(shown):
         lines.append(f"  ... and {len(rows) - len(shown)} more components")
     turned = [v.name for v in estimate.variables if v.manifold != "vector"]

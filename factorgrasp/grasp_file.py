@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 
 from factorgrasp.errors import InputError
 from factorgrasp.lie import quaternion_wxyz_to_matrix
 from factorgrasp.models.robot import load_robot
+from factorgrasp.problems.grasp_from_poses import (
+    GraspFromPosesNoise,
+    GraspFromPosesSettings,
+    GraspPoseFromPoses,
+)
+from factorgrasp.problems.grasp_kinematics import RobotStream
 from factorgrasp.problems.grasp_pose import GraspPose
 from factorgrasp.problems.grasp_settings import GraspNoise, GraspPrior, GraspSettings
 from factorgrasp.recordings import (
-    ImuStream,
     JointStream,
-    MotionStream,
-    PoseStream,
     column_names,
     read_imu,
     read_joints,
@@ -30,7 +33,14 @@ from factorgrasp.toml_tables import check_keys, convert, from_table, get, place,
 TABLES = ("robot", "hand", "noise", "estimate", "prior")
 
 Columns = Literal["poses", "imu", "motion", "joints"]
-_MARKS = {"poses": ("px", "qw"), "imu": ("wx", "ax")}
+_READERS: dict[Columns, Callable[[Path, str, bool], RobotStream]] = {
+    "poses": read_poses,
+    "imu": read_imu,
+    "motion": read_motion,
+    "joints": read_joints,
+}
+# One column tells what is meant; the reader then says what is missing.
+_MARKS: dict[str, Columns] = {"px": "poses", "alx": "motion", "wx": "imu", "q1": "joints"}
 
 # What the tables call settings that belong together or go by another name elsewhere.
 _ALIASES = {
@@ -40,7 +50,7 @@ _ALIASES = {
 }
 
 
-def build(table: Mapping[str, Any], base_dir: Path) -> GraspPose:
+def build(table: Mapping[str, Any], base_dir: Path) -> GraspPose | GraspPoseFromPoses:
     """The grasp-pose problem of a problem file.
 
     Parameters
@@ -61,53 +71,80 @@ def build(table: Mapping[str, Any], base_dir: Path) -> GraspPose:
     check_keys(hand, ("file", "columns", "check_units"), "[hand]")
 
     # Cheap mistakes first: a wrong switch is said before a long recording is read.
-    noise = from_table(GraspNoise, sub_table(table, "noise"), "[noise]")
-    settings = _settings(sub_table(table, "estimate"), robot)
+    robot_columns = _columns(robot, "robot", base_dir, "poses")
+    hand_columns = _columns(hand, "hand", base_dir, "imu")
     prior = _prior(table)
+    if hand_columns == "poses":
+        return _from_poses(table, base_dir, robot_columns, prior)
+    if hand_columns != "imu":
+        raise InputError(
+            "[hand] file", "an IMU (t,wx,wy,wz,ax,ay,az) or poses (t,px,py,pz,qw,qx,qy,qz)", hand_columns
+        )
+    noise = from_table(GraspNoise, sub_table(table, "noise"), "[noise]")
+    settings = from_table(GraspSettings, _estimate_table(table), "[estimate]")
     gravity = get(robot, "gravity", tuple[float, float, float], "[robot]", (0.0, 0.0, -9.80665))
-
-    robot_stream = _read(robot, "robot", base_dir, "poses")
-    hand_stream = _read(hand, "hand", base_dir, "imu")
-    if not isinstance(hand_stream, ImuStream):
-        raise InputError("[hand] file", "an IMU (columns t,wx,wy,wz,ax,ay,az)", type(hand_stream).__name__)
-    model = _robot_model(robot, robot_stream, base_dir)
+    robot_stream = _READERS[robot_columns](*_reading(robot, "robot", base_dir))
     return GraspPose(
         robot=robot_stream,
-        hand=hand_stream,
+        hand=read_imu(*_reading(hand, "hand", base_dir)),
         noise=noise,
         settings=settings,
         gravity=gravity,
         prior=prior,
-        **model,
+        **_robot_model(robot, robot_stream, base_dir),
     )
 
 
-def _read(
-    table: Mapping[str, Any], side: str, base_dir: Path, preferred: Columns
-) -> PoseStream | ImuStream | MotionStream | JointStream:
+def _from_poses(
+    table: Mapping[str, Any], base_dir: Path, robot_columns: Columns, prior: GraspPrior | None
+) -> GraspPoseFromPoses:
+    """The problem of a hand whose pose is measured, by a camera or by markers."""
+    robot, hand = table["robot"], table["hand"]
+    if robot_columns != "poses":
+        raise InputError(
+            "[robot] file", "poses (t,px,py,pz,qw,qx,qy,qz), as the hand has them", robot_columns
+        )
+    for key in ("gravity", "urdf", "frame", "bandwidth"):
+        if key in robot:
+            raise InputError(
+                place("[robot]", key), "an IMU in [hand] file", "poses, for which it means nothing"
+            )
+    noise = from_table(GraspFromPosesNoise, sub_table(table, "noise"), "[noise]")
+    settings = from_table(GraspFromPosesSettings, _estimate_table(table), "[estimate]")
+    return GraspPoseFromPoses(
+        robot=read_poses(*_reading(robot, "robot", base_dir)),
+        hand=read_poses(*_reading(hand, "hand", base_dir)),
+        noise=noise,
+        settings=settings,
+        prior=prior,
+    )
+
+
+def _columns(table: Mapping[str, Any], side: str, base_dir: Path, preferred: Columns) -> Columns:
+    """What a table is read as: what the file says, else what its columns say."""
     where = f"[{side}]"
     path = base_dir / get(table, "file", str, where)
-    check_units = get(table, "check_units", bool, where, True)
-    columns = get(table, "columns", Columns, where, None)
-    if columns is None:
-        names = set(column_names(path))
-        # A log of everything is common; the two sides of a grasp say what they are read as by default.
-        if all(names.issuperset(mark) for mark in _MARKS.values()):
-            columns = preferred
-    if columns is None:
-        return read_stream(path, side, check_units)
-    if columns == "poses":
-        return read_poses(path, side, check_units)
-    if columns == "imu":
-        return read_imu(path, side, check_units)
-    if columns == "motion":
-        return read_motion(path, side, check_units)
-    return read_joints(path, side, check_units)
+    stated = get(table, "columns", Columns, where, None)
+    if stated is not None:
+        return cast(Columns, stated)
+    names = column_names(path)
+    fits = [kind for mark, kind in _MARKS.items() if mark in names]
+    if not fits:
+        read_stream(path, side)  # raises, in the words of all recordings
+    # A log of everything is common; the two sides of a grasp are read as what they usually are.
+    return preferred if preferred in fits else fits[0]
 
 
-def _settings(table: Mapping[str, Any], robot: Mapping[str, Any]) -> GraspSettings:
+def _reading(table: Mapping[str, Any], side: str, base_dir: Path) -> tuple[Path, str, bool]:
+    """Arguments of a reader: path, name and whether units are checked."""
+    where = f"[{side}]"
+    return base_dir / get(table, "file", str, where), side, get(table, "check_units", bool, where, True)
+
+
+def _estimate_table(table: Mapping[str, Any]) -> dict[str, Any]:
+    """[estimate] with its aliases, and [robot] bandwidth, under the names of the settings."""
     where = "[estimate]"
-    values = dict(table)
+    values = dict(sub_table(table, "estimate"))
     for alias, targets in _ALIASES.items():
         if alias in values:
             value = values.pop(alias)
@@ -115,11 +152,12 @@ def _settings(table: Mapping[str, Any], robot: Mapping[str, Any]) -> GraspSettin
                 if target in values:
                     raise InputError(place(where, alias), f"either {alias} or {target}", "both")
                 values[target] = value
+    robot = table["robot"]
     if "bandwidth" in robot:
         if "kinematics_bandwidth" in values:
             raise InputError("[robot] bandwidth", "either this or [estimate] kinematics_bandwidth", "both")
         values["kinematics_bandwidth"] = get(robot, "bandwidth", float, "[robot]")
-    return from_table(GraspSettings, values, where)
+    return values
 
 
 def _prior(table: Mapping[str, Any]) -> GraspPrior | None:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 
 from factorgrasp import lie, plots
 from factorgrasp.atomic import replacing
+from factorgrasp.grasp_scene import draw_grasp, grasp_scene
 from factorgrasp.problems.grasp_estimate import GraspDiagnostics, GraspPoseEstimate
+from factorgrasp.problems.grasp_from_poses_estimate import GraspFromPosesEstimate
 from factorgrasp.report import (
     NBSP,
     PM,
@@ -16,6 +19,7 @@ from factorgrasp.report import (
     Report,
     Section,
     Table,
+    decimals,
     observability_section,
     quantity,
     residual_section,
@@ -23,21 +27,34 @@ from factorgrasp.report import (
 )
 from factorgrasp.typing import FloatArray
 
+AnyGrasp: TypeAlias = GraspPoseEstimate | GraspFromPosesEstimate
+
 _GYRO_UNIT, _FORCE_UNIT = "mrad/s/√Hz", "mm/s²/√Hz"
 # A second peak of the clock search this close to the best one could be the right one.
 _AMBIGUOUS = 0.95
 
 
 def build(estimate: GraspPoseEstimate) -> Report:
-    """The report of a grasp pose."""
+    """The report of a grasp pose from an IMU on the hand."""
+    d = estimate.diagnostics
+    middle = (_agreement(d), _spectrum(d), _data(estimate))
+    return _report(estimate, (*_pose_cards(estimate), *_clock_card(estimate), *_bias_cards(estimate)), middle)
+
+
+def build_from_poses(estimate: GraspFromPosesEstimate) -> Report:
+    """The report of a grasp pose from poses of the hand."""
+    return _report(estimate, (*_pose_cards(estimate), *_clock_card(estimate)), (_pose_agreement(estimate),))
+
+
+def _report(estimate: AnyGrasp, cards: tuple[Card, ...], middle: tuple[Section, ...]) -> Report:
     inner = estimate.estimate
     sections = [_scene(estimate)]
     if inner.observability is not None:
         sections.append(observability_section(inner))
-    sections += [_agreement(estimate.diagnostics), _spectrum(estimate.diagnostics), _data(estimate)]
+    sections += middle
     if inner.residuals:
         sections.append(residual_section(inner))
-    return Report("Where the hand holds", _sentence(estimate), _cards(estimate), tuple(sections))
+    return Report("Where the hand holds", _sentence(estimate), cards, tuple(sections))
 
 
 def plot_grasp(estimate: GraspPoseEstimate, path: Path) -> Path:
@@ -48,7 +65,7 @@ def plot_grasp(estimate: GraspPoseEstimate, path: Path) -> Path:
     assert grid is not None
     for unused in axes[:2]:
         unused.remove()
-    plots.draw_grasp(
+    draw_grasp(
         made.add_subplot(grid[0, :]), estimate.rotation, estimate.translation, estimate.covariance[3:, 3:]
     )
     for ax, (title, unit, t, level, declared) in zip(axes[2:4], _levels(d), strict=True):
@@ -62,95 +79,105 @@ def plot_grasp(estimate: GraspPoseEstimate, path: Path) -> Path:
     return path
 
 
-def _sentence(estimate: GraspPoseEstimate) -> str:
-    distance = float(np.linalg.norm(estimate.translation))
-    angle = float(lie.angle_between(np.eye(3), estimate.rotation))
-    rotation, position = _rms_sd(estimate.covariance)
+def _sentence(estimate: AnyGrasp) -> str:
+    distance = quantity(float(np.linalg.norm(estimate.translation)), "m", 4)
+    angle = f"{significant(float(np.degrees(lie.angle_between(np.eye(3), estimate.rotation))), 5)}°"
+    if not np.isfinite(estimate.covariance).all():
+        return (
+            f"The last step had the hand {distance} from the robot's end-effector, turned against it by {angle}; "
+            "how sure that is cannot be said."
+        )
+    rotation, position = (PM + words for words in _rms_sd(estimate.covariance))
     if not estimate.status.ok:
         return (
-            f"The hand is turned against the robot's end-effector by {significant(float(np.degrees(angle)), 4)}° "
-            f"{PM}{quantity(rotation, 'rad')}; where it holds is known only in part: {quantity(distance, 'm', 3)} away, "
-            f"{PM}{quantity(position, 'm')} in the mean over all directions."
+            f"The hand is turned against the robot's end-effector by {angle} {rotation}; where it holds is known only "
+            f"in part: {distance} away, {position} in the mean over all directions."
         )
     return (
-        f"The hand is {quantity(distance, 'm', 4)} from the robot's end-effector and turned against it by "
-        f"{significant(float(np.degrees(angle)), 5)}°. Its position is known to {PM}{quantity(position, 'm')}, "
-        f"its orientation to {PM}{quantity(rotation, 'rad')}."
+        f"The hand is {distance} from the robot's end-effector and turned against it by {angle}. "
+        f"Its position is known to {position}, its orientation to {rotation}."
     )
 
 
-def _rms_sd(covariance: FloatArray) -> tuple[float, float]:
-    """Root of the mean variance of rotation (rad) and translation (m)."""
+def _rms_sd(covariance: FloatArray) -> tuple[str, str]:
+    """Root of the mean variance of rotation and translation, in words."""
     variances = np.diag(covariance)
-    return float(np.sqrt(variances[:3].mean())), float(np.sqrt(variances[3:].mean()))
+    return quantity(float(np.sqrt(variances[:3].mean())), "rad"), quantity(
+        float(np.sqrt(variances[3:].mean())), "m"
+    )
 
 
-def _cards(estimate: GraspPoseEstimate) -> tuple[Card, ...]:
+def _pose_cards(estimate: AnyGrasp) -> tuple[Card, ...]:
     sd = np.sqrt(np.diag(estimate.covariance))
-    cards = [
-        Card(
+    turn = lie.so3_log(estimate.rotation)
+    angle = float(np.linalg.norm(turn))
+    # Adding zero turns -0.0 into 0.0.
+    axis = ", ".join(f"{value:.3f}" for value in np.round(turn / max(angle, 1e-12), 3) + 0.0)
+    about = f"a turn by {np.degrees(angle):.4g}° about ({axis})"
+    spread = ", ".join(significant(float(np.degrees(value))) for value in sd[:3])
+    return (
+        _card(
             "Position of the hand x, y, z",
-            ", ".join(f"{1000.0 * value:.1f}" for value in estimate.translation) + f"{NBSP}mm",
-            PM + ", ".join(significant(1000.0 * value) for value in sd[3:]) + f"{NBSP}mm",
+            1000.0 * estimate.translation,
+            1000.0 * sd[3:],
+            f"{NBSP}mm",
             "p_r_h: where the hand's sensor sits, in the end-effector's axes",
         ),
         Card(
             "Orientation of the hand w, x, y, z",
-            ", ".join(f"{value:.4f}" for value in estimate.rotation_wxyz),
-            PM + ", ".join(significant(float(np.degrees(value))) for value in sd[:3]) + "°",
-            "R_r_h as a unit quaternion; its spread about the hand's x, y, z",
+            ", ".join(f"{value:.5f}" for value in estimate.rotation_wxyz),
+            f"{PM}{spread}°" if np.isfinite(sd).all() else "",
+            f"R_r_h as a unit quaternion: {about}. Its spread is about the hand's x, y, z",
         ),
-    ]
-    if estimate.time_offset_sd > 0.0:
-        ahead = "ahead of" if estimate.time_offset >= 0.0 else "behind"
-        cards.append(
-            Card(
-                "Clocks",
-                f"{1000.0 * abs(estimate.time_offset):.2f} ms",
-                PM + quantity(estimate.time_offset_sd, "s"),
-                f"the hand's clock is {ahead} the robot's",
-            )
-        )
-    if np.any(estimate.gyro_bias_sd > 0.0):
-        cards.append(
-            _bias_card(
-                "Gyroscope bias x, y, z", estimate.gyro_bias, estimate.gyro_bias_sd, 180.0 / np.pi, "°/s"
-            )
-        )
-    if np.any(estimate.accelerometer_bias_sd > 0.0):
-        cards.append(
-            _bias_card(
-                "Accelerometer bias x, y, z",
+    )
+
+
+def _clock_card(estimate: AnyGrasp) -> tuple[Card, ...]:
+    if estimate.time_offset_sd == 0.0:
+        return ()
+    ahead = "ahead of" if estimate.time_offset >= 0.0 else "behind"
+    offset, sd = (
+        np.array([1000.0 * value]) for value in (abs(estimate.time_offset), estimate.time_offset_sd)
+    )
+    return (_card("Clocks", offset, sd, f"{NBSP}ms", f"the hand's clock is {ahead} the robot's"),)
+
+
+def _bias_cards(estimate: GraspPoseEstimate) -> list[Card]:
+    return [
+        _card(f"{name} bias x, y, z", scale * bias, scale * sd, unit, "constant, in the sensor's axes")
+        for name, bias, sd, scale, unit in (
+            ("Gyroscope", estimate.gyro_bias, estimate.gyro_bias_sd, 180.0 / np.pi, "°/s"),
+            (
+                "Accelerometer",
                 estimate.accelerometer_bias,
                 estimate.accelerometer_bias_sd,
                 1000.0,
-                "mm/s²",
-            )
+                f"{NBSP}mm/s²",
+            ),
         )
-    return tuple(cards)
+        if np.any(sd != 0.0)
+    ]
 
 
-def _bias_card(label: str, value: FloatArray, sd: FloatArray, scale: float, unit: str) -> Card:
-    digits = max(0, 1 - int(np.floor(np.log10(scale * float(sd.min()))))) if float(sd.min()) > 0.0 else 3
+def _card(label: str, values: FloatArray, sd: FloatArray, unit: str, note: str) -> Card:
+    """Values to the second digit of the smallest standard deviation."""
+    digits = decimals(float(sd.min())) if np.isfinite(sd).all() else 3
     return Card(
         label,
-        ", ".join(f"{scale * v:.{digits}f}" for v in value) + f"{NBSP}{unit}",
-        PM + ", ".join(significant(scale * v) for v in sd) + f"{NBSP}{unit}",
-        "constant, in the sensor's axes",
+        ", ".join(f"{value:.{digits}f}" for value in values) + unit,
+        PM + ", ".join(significant(float(value)) for value in sd) + unit if np.isfinite(sd).all() else "",
+        note,
     )
 
 
-def _scene(estimate: GraspPoseEstimate) -> Section:
-    drawn, magnification = plots.grasp_scene(
-        estimate.rotation, estimate.translation, estimate.covariance[3:, 3:]
-    )
-    size = "at its true size" if magnification == 1.0 else f"{magnification:g} times enlarged"
-    return Section(
-        "The grasp",
-        svg=plots.to_svg(drawn, "grasp"),
-        caption="The dashed path leads from the end-effector to the hand along the end-effector's own axes. "
-        f"The ellipsoid holds the hand's position with a probability of 95 %; it is drawn {size}.",
-    )
+def _scene(estimate: AnyGrasp) -> Section:
+    picture, drawn = grasp_scene(estimate.rotation, estimate.translation, estimate.covariance[3:, 3:])
+    caption = "The dashed path leads from the end-effector to the hand along the end-effector's own axes."
+    if drawn.magnification > 0.0:
+        size = "at its true size" if drawn.magnification == 1.0 else f"{drawn.magnification:g} times enlarged"
+        exceeds = ", and exceeds the picture" if drawn.exceeds else ""
+        caption += f" The ellipsoid holds the hand's position with a probability of 95 %; it is drawn {size}{exceeds}."
+    return Section("The grasp", svg=plots.to_svg(picture, "grasp"), caption=caption)
 
 
 def _levels(d: GraspDiagnostics) -> list[tuple[str, str, FloatArray, FloatArray, float]]:
@@ -252,4 +279,29 @@ def _data(estimate: GraspPoseEstimate) -> Section:
         svg=plots.to_svg(plots.coverage(d.t, d.window_seconds, span), "coverage"),
         caption="Green: used. Red: a window there touches a gap on one of the two sides.",
         table=Table(("side", "gaps", "missing", "incomplete rows"), rows),
+    )
+
+
+def _pose_agreement(estimate: GraspFromPosesEstimate) -> Section:
+    d = estimate.diagnostics
+    declared = np.sqrt(np.diag(d.noise_covariance))
+    order = np.argsort(d.t)
+    t, step = d.t[order], float(np.median(np.diff(d.t[order])))
+    panels = [
+        (
+            "Rotation",
+            "°",
+            t,
+            np.degrees(np.abs(d.rotation_residual[order])),
+            float(np.degrees(_rms(declared[:3]))),
+        ),
+        ("Position", "mm", t, 1000.0 * np.abs(d.position_residual[order]), 1000.0 * _rms(declared[3:])),
+    ]
+    return Section(
+        "How well both sides agree",
+        f"{d.samples_used} samples of the {d.sampled} side were compared, {d.samples_dropped} lie beside a gap or outside of the other "
+        f"recording and were left out. Both sides differ by {quantity(d.rotation_rms, 'rad')} and {quantity(d.position_rms, 'm')} "
+        "(root mean square).",
+        svg=plots.to_svg(plots.over_time(panels, 5.0 * step), "agreement"),
+        caption="Size of the difference along each axis of the hand, against the standard deviation with which it was weighted.",
     )

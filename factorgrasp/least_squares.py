@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from factorgrasp.block_rows import BlockRows, RowBlock
 from factorgrasp.errors import InputError
 from factorgrasp.losses import Loss
-from factorgrasp.typing import BoolArray, FloatArray
+from factorgrasp.typing import BoolArray, FloatArray, IntArray
 from factorgrasp.uncertainty import Covariance
 from factorgrasp.variables import Variable, slices
 
@@ -310,12 +310,19 @@ class LeastSquares:
         indptr = self.jacobian.matrix.indptr
         starts = indptr[where.start : where.stop : size].astype(np.intp)
         widths = (indptr[where.start + 1 : where.stop + 1 : size] - starts).astype(np.intp)
+        # A NaN or an infinity is named by the caller; numpy's warning would say less.
+        with np.errstate(invalid="ignore"):
+            self._multiply_blocks(roots, data, starts, widths)
+            rhs[where] = (roots @ rhs[where].reshape(-1, size, 1)).ravel()
+
+    @staticmethod
+    def _multiply_blocks(roots: FloatArray, data: FloatArray, starts: IntArray, widths: IntArray) -> None:
+        size = roots.shape[1]
         for width in np.unique(widths):
             chosen = np.flatnonzero(widths == width)
             entries = starts[chosen, None] + np.arange(size * width)
             values = data[entries].reshape(chosen.size, size, width)
             data[entries] = (roots[chosen] @ values).reshape(chosen.size, -1)
-        rhs[where] = (roots @ rhs[where].reshape(-1, size, 1)).ravel()
 
 
 def _row_block(item: Term | Constraint, sizes: Mapping[str, int], block: int = 1) -> RowBlock:

@@ -10,7 +10,7 @@ import io
 import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import wraps
-from typing import TYPE_CHECKING, Any, NamedTuple, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 import numpy as np
 
@@ -32,8 +32,6 @@ PALETTE: Mapping[str, str] = {
     "accent": "#b8791a",
 }
 AXES = ("x", "y", "z")
-CHI2_95 = 7.815
-"""95 % quantile of chi-square with 3 degrees of freedom: an ellipsoid of that many squared standard deviations holds 95 %."""
 
 # matplotlib types its settings by a literal of all their names; a plain mapping is clearer here.
 _STYLE: Any = {
@@ -71,7 +69,7 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 
-def _styled(draw: Callable[P, T]) -> Callable[P, T]:
+def styled(draw: Callable[P, T]) -> Callable[P, T]:
     """Run a function with the style of this file: matplotlib reads its settings at every step, not only at the first."""
 
     @wraps(draw)
@@ -84,7 +82,7 @@ def _styled(draw: Callable[P, T]) -> Callable[P, T]:
     return wrapped
 
 
-@_styled
+@styled
 def figure(
     width: float, height: float, rows: int = 1, columns: int = 1, **subplots: Any
 ) -> tuple[Figure, list[Axes]]:
@@ -96,7 +94,7 @@ def figure(
     return made, list(axes.ravel())
 
 
-@_styled
+@styled
 def to_svg(made: Figure, name: str) -> str:
     """The figure as an ``<svg>`` element to stand inside a page; `name` keeps its ids apart from those of other figures."""
     import matplotlib
@@ -121,215 +119,6 @@ def to_svg(made: Figure, name: str) -> str:
     return svg
 
 
-def grasp_scene(
-    rotation: FloatArray, translation: FloatArray, covariance: FloatArray
-) -> tuple[Figure, float]:
-    """Both frames of a grasp in a picture as high as it needs; see :func:`draw_grasp`."""
-    _, low, high = _scene_limits(rotation, translation)
-    width = 7.2
-    made, (axes,) = figure(width, float(np.clip(width * (high[1] - low[1]) / (high[0] - low[0]), 2.2, 4.5)))
-    return made, draw_grasp(axes, rotation, translation, covariance)
-
-
-def _arrow(translation: FloatArray) -> float:
-    """Length of a frame's axes in the scene, m."""
-    return float(np.clip(0.3 * np.linalg.norm(translation), 0.06, 0.25))
-
-
-def _scene_limits(rotation: FloatArray, translation: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """View (2, 3), and lower left and upper right of what it shows, in m."""
-    view, arrow = _view(rotation, translation), _arrow(translation)
-    tips = arrow * np.hstack([np.eye(3), rotation]).T + np.repeat([np.zeros(3), translation], 3, axis=0)
-    ends = np.vstack([_legs(translation), tips]) @ view.T
-    return view, ends.min(axis=0) - 0.4 * arrow, ends.max(axis=0) + 0.4 * arrow
-
-
-def _legs(translation: FloatArray) -> FloatArray:
-    """Corners (4, 3) of the way from the origin to a point along x, then y, then z."""
-    return np.asarray(np.tril(np.ones((4, 3)), -1) * translation)
-
-
-@_styled
-def draw_grasp(axes: Axes, rotation: FloatArray, translation: FloatArray, covariance: FloatArray) -> float:
-    """Both frames of a grasp in a parallel projection, with the 95 % ellipsoid of the hand's position.
-
-    Parameters
-    ----------
-    axes : Axes
-    rotation : (3, 3) ndarray
-        ``R_r_h``.
-    translation : (3,) ndarray
-        ``p_r_h``, m.
-    covariance : (3, 3) ndarray
-        Of the translation, m^2.
-
-    Returns
-    -------
-    float
-        How many times its size the ellipsoid is drawn.
-    """
-    from matplotlib.patches import Ellipse
-
-    reach, arrow = float(np.linalg.norm(translation)), _arrow(translation)
-    view, low, high = _scene_limits(rotation, translation)
-    path = _legs(translation) @ view.T
-    axes.set_axis_off()
-    axes.set_aspect("equal", adjustable="box")
-    axes.plot(path[[0, 3], 0], path[[0, 3], 1], color=PALETTE["ink"], linewidth=2.2, zorder=3)
-    for k, axis in enumerate(AXES):
-        (x0, y0), (x1, y1) = path[k], path[k + 1]
-        axes.plot([x0, x1], [y0, y1], color=PALETTE[axis], linewidth=1.0, linestyle=(0, (2, 2)), zorder=2)
-        # A word beside a short leg would only cover the hand; the figures stand in the text, too.
-        if np.hypot(x1 - x0, y1 - y0) > 0.25 * reach:
-            upright = abs(y1 - y0) > abs(x1 - x0)
-            axes.annotate(
-                f"{axis} {1000.0 * translation[k]:.0f} mm",
-                (0.5 * (x0 + x1), 0.5 * (y0 + y1)),
-                (6, 0) if upright else (0, -9),
-                textcoords="offset points",
-                ha="left" if upright else "center",
-                va="center",
-                fontsize=8.0,
-                color=PALETTE[axis],
-            )
-    _triad(axes, view, np.zeros(3), np.eye(3), arrow, "robot end-effector r", path[3])
-    _triad(axes, view, translation, rotation, arrow, "hand h", -path[3])
-
-    shadow = _shadow(view, covariance)
-    magnification = _magnification(shadow.half_axes[1], 0.35 * arrow)
-    axes.add_patch(
-        Ellipse(
-            _pair(view @ translation),
-            2.0 * magnification * shadow.half_axes[0],
-            2.0 * magnification * shadow.half_axes[1],
-            angle=shadow.angle,
-            facecolor=PALETTE["accent"],
-            edgecolor=PALETTE["accent"],
-            alpha=0.28,
-            linewidth=1.0,
-            zorder=1,
-        )
-    )
-    # A position that is hardly known may be larger than the picture; a part of it says so well enough.
-    room = np.minimum(magnification * shadow.extent, max(reach, 2.0 * arrow))
-    centre = view @ translation
-    low, high = np.minimum(low, centre - 1.1 * room), np.maximum(high, centre + 1.1 * room)
-    axes.set_xlim(low[0], high[0])
-    axes.set_ylim(low[1], high[1])
-    return magnification
-
-
-class _Shadow(NamedTuple):
-    """Ellipse that an ellipsoid casts: half axes ascending (m), angle of the first (deg), half extent right and up (m)."""
-
-    half_axes: tuple[float, float]
-    angle: float
-    extent: FloatArray
-
-
-def _shadow(view: FloatArray, covariance: FloatArray) -> _Shadow:
-    """Under a parallel projection, an ellipsoid casts the ellipse of its projected covariance."""
-    flat = view @ covariance @ view.T
-    values, vectors = np.linalg.eigh(0.5 * (flat + flat.T))
-    half = np.sqrt(np.maximum(values, 0.0) * CHI2_95)
-    angle = float(np.degrees(np.arctan2(vectors[1, 0], vectors[0, 0])))
-    extent = np.sqrt(np.maximum(np.diag(flat), 0.0) * CHI2_95)
-    return _Shadow((float(half[0]), float(half[1])), angle, extent)
-
-
-def _view(rotation: FloatArray, translation: FloatArray) -> FloatArray:
-    """Rows: right and up of the picture, in frame r; chosen so that the lever arm and all six axes can be told apart."""
-    best, best_score = np.eye(3)[:2], -np.inf
-    reach = float(np.linalg.norm(translation))
-    for azimuth in np.deg2rad(np.arange(0.0, 360.0, 15.0)):
-        for elevation in np.deg2rad((20.0, 30.0)):
-            right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
-            back = np.array(
-                [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
-            )
-            view = np.vstack([right, np.cross(back, right)])
-            clarity = min(_clarity(view), _clarity(view @ rotation))
-            along = float(np.linalg.norm(view @ translation)) / reach if reach > 0.0 else 1.0
-            # Left to right reads best.
-            rightwards = float(right @ translation) / reach if reach > 0.0 else 0.0
-            score = 2.0 * along + clarity + 0.5 * rightwards
-            if score > best_score:
-                best, best_score = view, score
-    return best
-
-
-def _clarity(tips: FloatArray) -> float:
-    """How well three projected unit axes (2, 3) can be told apart: their smallest distance from each other and from their origin."""
-    points = np.column_stack([tips, np.zeros(2)])
-    return float(min(np.linalg.norm(points[:, i] - points[:, j]) for i in range(4) for j in range(i)))
-
-
-def _triad(
-    axes: Axes,
-    view: FloatArray,
-    origin: FloatArray,
-    rotation: FloatArray,
-    length: float,
-    label: str,
-    towards: FloatArray,
-) -> None:
-    """A frame's axes with its name, which goes where neither they nor the way `towards` the other frame lead."""
-    start = _pair(view @ origin)
-    for k, axis in enumerate(AXES):
-        end = _pair(view @ (origin + length * rotation[:, k]))
-        axes.annotate(
-            "",
-            end,
-            start,
-            arrowprops={
-                "arrowstyle": "-|>,head_length=0.45,head_width=0.2",
-                "color": PALETTE[axis],
-                "linewidth": 2.0,
-                "shrinkA": 0.0,
-                "shrinkB": 0.0,
-            },
-            zorder=5,
-        )
-        tip = _pair(view @ (origin + 1.13 * length * rotation[:, k]))
-        axes.text(
-            tip[0], tip[1], axis, color=PALETTE[axis], ha="center", va="center", fontsize=9.0, weight="bold"
-        )
-    axes.plot([start[0]], [start[1]], marker="o", markersize=5.0, color=PALETTE["ink"], zorder=6)
-    apart = float(np.linalg.norm(towards))
-    if apart < 0.3 * length:
-        # Both frames in one place: one name above, one below.
-        x, y, align = 0.0, (16.0 if label.startswith("hand") else -16.0), "center"
-    else:
-        ways = [view @ rotation[:, k] for k in range(3)] + [towards / apart]
-        candidates = {(0.0, -1.0): "center", (0.0, 1.0): "center", (1.0, 0.0): "left", (-1.0, 0.0): "right"}
-        x, y = min(candidates, key=lambda way: max(float(np.dot(way, other)) for other in ways))
-        align = candidates[x, y]
-        x, y = 9.0 * x, 15.0 * y
-    axes.annotate(
-        label,
-        start,
-        (x, y),
-        textcoords="offset points",
-        ha=align,
-        va="center",
-        fontsize=9.5,
-        color=PALETTE["ink"],
-        zorder=7,
-    )
-
-
-def _pair(point: FloatArray) -> tuple[float, float]:
-    return float(point[0]), float(point[1])
-
-
-def _magnification(size: float, wanted: float) -> float:
-    """1, 2, 5, 10, ... times, so that `size` is drawn at about `wanted` and never smaller than it is."""
-    if size <= 0.0 or wanted <= size:
-        return 1.0
-    decade = 10.0 ** np.floor(np.log10(wanted / size))
-    return float(decade * max(step for step in (1.0, 2.0, 5.0) if step * decade <= wanted / size))
-
-
 def over_time(panels: Sequence[tuple[str, str, FloatArray, FloatArray, float]], width: float) -> Figure:
     """One panel a sensor of :func:`draw_over_time`: (title, unit, t, level, declared) each."""
     made, axes = figure(7.2, 1.75 * len(panels) + 0.2, rows=len(panels), sharex=True)
@@ -339,7 +128,7 @@ def over_time(panels: Sequence[tuple[str, str, FloatArray, FloatArray, float]], 
     return made
 
 
-@_styled
+@styled
 def draw_over_time(
     ax: Axes, title: str, unit: str, t: FloatArray, level: FloatArray, declared: float, width: float
 ) -> None:
@@ -401,7 +190,7 @@ def spectrum(panels: Sequence[tuple[str, str, FloatArray, FloatArray, FloatArray
     return made
 
 
-@_styled
+@styled
 def draw_spectrum(
     ax: Axes, title: str, unit: str, frequency: FloatArray, measured: FloatArray, declared: FloatArray
 ) -> None:
@@ -435,7 +224,7 @@ def draw_spectrum(
     _legend_above(ax)
 
 
-@_styled
+@styled
 def coverage(
     t: FloatArray, width: float, span: tuple[float, float], events: Sequence[tuple[float, str]] = ()
 ) -> Figure:

@@ -41,31 +41,25 @@ def problem_hash(kind: str, problem: LeastSquares, state: State | None = None) -
 
 def versions(modules: Iterable[str] = ()) -> dict[str, str]:
     """Versions of Python, factorgrasp, numpy, scipy and the distributions that provide `modules`; unknown ones are left out."""
-    out = {"python": platform.python_version(), "factorgrasp": _own_version()}
+    from factorgrasp import __version__
+
+    out = {"python": platform.python_version(), "factorgrasp": __version__}
     for module in ("numpy", "scipy", *modules):
-        name = _distribution(module)
-        if name is not None:
-            out[name] = version(name)
+        found = _distribution(module)
+        if found is not None:
+            out[found[0]] = found[1]
     return out
 
 
 @cache
-def _own_version() -> str:
-    from factorgrasp import __version__
-
-    return __version__
-
-
-@cache
-def _distribution(module: str) -> str | None:
-    """Name of the distribution that provides a top-level module."""
+def _distribution(module: str) -> tuple[str, str] | None:
+    """Name and version of the distribution that provides a top-level module."""
     try:
-        version(module)
+        return module, version(module)
     except PackageNotFoundError:
         # Reading the map of all distributions takes tens of milliseconds: only where the names differ.
         found = packages_distributions().get(module)
-        return found[0] if found else None
-    return module
+        return (found[0], version(found[0])) if found else None
 
 
 def _feed_words(digest: hashlib._Hash, words: Iterable[str]) -> None:

@@ -22,6 +22,7 @@ from factorgrasp.status import Status
 
 BUILDERS: dict[str, str] = {
     "grasp_pose": "factorgrasp.grasp_report:build",
+    "grasp_pose_from_poses": "factorgrasp.grasp_report:build_from_poses",
 }
 """``"module:function"`` of the builder of a kind; it takes the typed view of an estimate and returns a :class:`Report`."""
 
@@ -117,7 +118,9 @@ def core(estimate: Any) -> Estimate:
     return estimate if isinstance(estimate, Estimate) else cast(Estimate, estimate.estimate)
 
 
-def write_report(estimate: Any, path: Path, title: str = "", source: str = "") -> Path:
+def write_report(
+    estimate: Any, path: Path, title: str = "", source: str = "", remarks: Sequence[str] = ()
+) -> Path:
     """Write the page of an estimate.
 
     Parameters
@@ -129,11 +132,15 @@ def write_report(estimate: Any, path: Path, title: str = "", source: str = "") -
         Of the recording, above the heading.
     source : str
         The problem file.
+    remarks : sequence of str
+        Warnings that came up on the way.
     """
-    return write_text(path, render(build_report(estimate), core(estimate), title, source))
+    return write_text(path, render(build_report(estimate), core(estimate), title, source, remarks))
 
 
-def render(report: Report, estimate: Estimate, title: str = "", source: str = "") -> str:
+def render(
+    report: Report, estimate: Estimate, title: str = "", source: str = "", remarks: Sequence[str] = ()
+) -> str:
     """The page as HTML text."""
     from jinja2 import Environment, StrictUndefined
 
@@ -145,6 +152,7 @@ def render(report: Report, estimate: Estimate, title: str = "", source: str = ""
         report=report,
         title=title,
         source=source,
+        remarks=remarks,
         status=STATUS_WORDS[estimate.status],
         solved=estimate.status.ok,
         message=estimate.message,
@@ -190,9 +198,7 @@ def observability_section(estimate: Estimate) -> Section:
     text = (
         "Every direction of the unknowns is informed well enough by the motion."
         if observability.complete
-        else "The motion did not inform "
-        + "; ".join(direction.words for direction in observability.missing)
-        + ". "
+        else "What stands in red was not informed: its standard deviation is larger than the resolution that is asked for. "
         + observability.advice
     )
     return Section(
@@ -247,10 +253,18 @@ def significant(value: float, digits: int = 2) -> str:
     """A number with `digits` significant digits and without an exponent where that is readable."""
     if value == 0.0 or not np.isfinite(value):
         return f"{value:g}"
-    power = int(np.floor(np.log10(abs(value))))
+    # Rounded first: 0.9996 to two digits is 1.0, not 1.00.
+    power = int(np.floor(np.log10(abs(float(f"{value:.{digits - 1}e}")))))
     if -5 <= power < 6:
         return f"{value:.{max(0, digits - 1 - power)}f}"
     return f"{value:.{digits - 1}e}"
+
+
+def decimals(spread: float) -> int:
+    """Decimals with which a value is written, so that its standard deviation shows two significant digits."""
+    if not np.isfinite(spread) or spread <= 0.0:
+        return 6
+    return int(np.clip(1 - np.floor(np.log10(spread)), 0, 9))
 
 
 def seconds_words(value: float) -> str:

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from factorgrasp.atomic import replacing, write_text
 from factorgrasp.typing import FloatArray, JsonDict
+
+if TYPE_CHECKING:
+    from factorgrasp.solvers.compare import Comparison
 
 JSON_NAME, NPZ_NAME, REPORT_NAME = "estimate.json", "estimate.npz", "report.html"
 
@@ -34,6 +37,12 @@ def write_result(directory: Path, record: JsonDict, arrays: Mapping[str, FloatAr
     return write_text(directory / JSON_NAME, text + "\n")
 
 
+def write_comparison(comparison: Comparison, directory: Path) -> list[Path]:
+    """Write a comparison of solvers as ``comparison.json``, ``.csv`` and ``.md``, each atomically; returns the paths."""
+    forms = {".json": comparison.json, ".csv": comparison.csv, ".md": comparison.markdown}
+    return [write_text(directory / f"comparison{suffix}", made()) for suffix, made in forms.items()]
+
+
 def finite(value: Any) -> Any:
     """The same record with None where a number is NaN or infinite."""
     if isinstance(value, float):
@@ -45,7 +54,9 @@ def finite(value: Any) -> Any:
     return value
 
 
-def write_all(estimate: Any, directory: Path, title: str = "", source: str = "") -> list[Path]:
+def write_all(
+    estimate: Any, directory: Path, title: str = "", source: str = "", remarks: Sequence[str] = ()
+) -> list[Path]:
     """Write the numbers and the report of an estimate (or of the typed view of one); returns the paths.
 
     Parameters
@@ -56,11 +67,13 @@ def write_all(estimate: Any, directory: Path, title: str = "", source: str = "")
         What the recording is called in the report.
     source : str
         The problem file, as provenance.
+    remarks : sequence of str
+        Warnings that came up, for the report.
     """
     from factorgrasp.report import write_report
 
     # A page of an earlier solve must not stand beside the numbers of this one, whatever happens in between.
     (directory / REPORT_NAME).unlink(missing_ok=True)
     estimate.save(directory)
-    report = write_report(estimate, directory / REPORT_NAME, title, source)
+    report = write_report(estimate, directory / REPORT_NAME, title, source, remarks)
     return [directory / JSON_NAME, directory / NPZ_NAME, report]

@@ -97,7 +97,9 @@ class Table:
         table = RichTable(title=self.title or None, box=SIMPLE_HEAD, title_justify="left", pad_edge=False)
         for column, numeric in zip(self.columns, self._numeric(), strict=True):
             # Brackets of a unit would be taken for markup.
-            table.add_column(column.title.replace("[", "\\["), justify="right" if numeric else "left", overflow="fold")
+            table.add_column(
+                column.title.replace("[", "\\["), justify="right" if numeric else "left", overflow="fold"
+            )
         for cells in self.cells():
             table.add_row(*(cell.replace("[", "\\[") for cell in cells))
         stream = io.StringIO()
@@ -131,9 +133,12 @@ class Table:
         return {
             "title": self.title,
             "columns": [
-                {"key": c.key, "header": c.header or c.key, "unit": c.unit, "scale": c.scale} for c in self.columns
+                {"key": c.key, "header": c.header or c.key, "unit": c.unit, "scale": c.scale}
+                for c in self.columns
             ],
-            "rows": [{column.key: plain(row.get(column.key)) for column in self.columns} for row in self.rows],
+            "rows": [
+                {column.key: plain(row.get(column.key)) for column in self.columns} for row in self.rows
+            ],
             "notes": list(self.notes),
         }
 
@@ -162,7 +167,11 @@ class Table:
         out = []
         for column in self.columns:
             values = [row.get(column.key) for row in self.rows if not is_missing(row.get(column.key))]
-            numbers = [v for v in values if isinstance(v, int | float | np.number) and not isinstance(v, bool | np.bool_)]
+            numbers = [
+                v
+                for v in values
+                if isinstance(v, int | float | np.number) and not isinstance(v, bool | np.bool_)
+            ]
             out.append(bool(values) and len(numbers) == len(values))
         return out
 

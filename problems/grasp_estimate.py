@@ -11,6 +11,8 @@ import numpy as np
 from factorgrasp import lie
 from factorgrasp.estimate import Estimate, TermSummary
 from factorgrasp.observability import Observability
+from factorgrasp.problems import grasp_words
+from factorgrasp.problems.grasp_recording import SMALLEST_CORRELATION
 from factorgrasp.status import Status
 from factorgrasp.typing import FloatArray, JsonDict
 
@@ -121,6 +123,9 @@ class GraspPoseEstimate:
             values["time_offset"] = np.array([total])
         diagnostics = problem.diagnostics(state)
         estimate = replace(estimate, values=values, residuals=_summaries(estimate, problem, state))
+        if diagnostics.clock_correlation < SMALLEST_CORRELATION:
+            words = grasp_words.unrelated(diagnostics.clock_correlation, diagnostics.rate_moment)
+            estimate = replace(estimate, status=Status.UNOBSERVABLE, message=words)
 
         def bias(name: str) -> tuple[FloatArray, FloatArray]:
             if name not in names:
@@ -135,7 +140,7 @@ class GraspPoseEstimate:
             translation=np.asarray(values["translation"]),
             covariance=estimate.covariance("rotation", "translation"),
             time_offset=total,
-            time_offset_sd=float(estimate.sd("time_offset")[0]) if "time_offset" in names else 0.0,
+            time_offset_sd=_time_offset_sd(estimate, problem),
             gyro_bias=gyro_bias,
             gyro_bias_sd=gyro_bias_sd,
             accelerometer_bias=accelerometer_bias,
@@ -147,6 +152,11 @@ class GraspPoseEstimate:
     def status(self) -> Status:
         """How the solve ended."""
         return self.estimate.status
+
+    @property
+    def solved(self) -> bool:
+        """Whether the status is `Status.SOLVED`."""
+        return self.estimate.solved
 
     @property
     def message(self) -> str:
@@ -169,6 +179,18 @@ class GraspPoseEstimate:
         out = np.eye(4)
         out[:3, :3], out[:3, 3] = self.rotation, self.translation
         return out
+
+    def error_to(self, rotation: FloatArray, translation: FloatArray) -> FloatArray:
+        """Tangent vector (6,) from this estimate to another grasp, in the coordinates of `covariance`: for NEES and comparisons.
+
+        Parameters
+        ----------
+        rotation : (3, 3) ndarray
+            ``R_r_h``.
+        translation : (3,) ndarray
+            ``p_r_h``, m.
+        """
+        return np.concatenate([lie.so3_log(self.rotation.T @ rotation), translation - self.translation])
 
     def summary(self) -> str:
         """A few lines for a terminal."""
@@ -257,6 +279,13 @@ class GraspPoseEstimate:
         from factorgrasp.grasp_report import plot_grasp
 
         return plot_grasp(self, Path(path))
+
+
+def _time_offset_sd(estimate: Estimate, problem: GraspPose) -> float:
+    """Posterior sd, s; the prior's where the motion could not show the offset; 0 where it was given."""
+    if any(variable.name == "time_offset" for variable in estimate.variables):
+        return float(estimate.sd("time_offset")[0])
+    return problem.noise.time_offset_sd if problem.settings.time_offset else 0.0
 
 
 def _triple(values: FloatArray, digits: int) -> str:

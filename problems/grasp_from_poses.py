@@ -17,7 +17,11 @@ from factorgrasp.errors import InputError
 from factorgrasp.estimate import Estimate
 from factorgrasp.least_squares import LeastSquares, Term
 from factorgrasp.losses import LOSSES, Loss, make_loss
-from factorgrasp.problems.cluster_scores import cluster_score_covariance
+from factorgrasp.problems.cluster_scores import (
+    cluster_score_covariance,
+    drowned_directions,
+    without_noise_information,
+)
 from factorgrasp.problems.grasp_from_poses_estimate import GraspFromPosesDiagnostics, GraspFromPosesEstimate
 from factorgrasp.problems.grasp_settings import GraspPrior
 from factorgrasp.problems.grasp_words import axis_words
@@ -25,9 +29,9 @@ from factorgrasp.problems.hand_eye_math import (
     COLUMNS,
     ClockMatch,
     PoseCoupling,
-    PoseCurve,
     coupling_rows,
     match_clocks,
+    noise_information,
     start_state,
 )
 from factorgrasp.recordings import PoseStream
@@ -47,6 +51,9 @@ _FEWEST_CLUSTERS = 4
 # 1 - |mean rotation| along an axis: 1e-4 is a rotation of about 1 deg rms.
 _HARDLY_ROTATES = 1e-4
 _ONE_AXIS = 0.02
+_HELD = "directions without information"
+# In posterior standard deviations of what noise pretends.
+_HELD_SD = 0.03
 
 
 @dataclass(frozen=True)
@@ -173,36 +180,32 @@ class GraspPoseFromPoses:
         self.noise, self.settings = noise or GraspFromPosesNoise(), settings or GraspFromPosesSettings()
         self.prior = prior or GraspPrior()
         self._streams = (robot, hand)
-        self._coupling = PoseCoupling(
-            PoseCurve.from_stream(robot, self.settings.max_gap),
-            PoseCurve.from_stream(hand, self.settings.max_gap),
-        )
+        self._coupling = PoseCoupling.from_streams(robot, hand, self.settings.max_gap)
         self.variables = _variables(self.settings)
         self._columns = slices(self.variables)
         self._loss = self.settings.make_loss()
         self.clock = self._match_clocks()
         self._covariance = np.diag(np.repeat([self.noise.rotation_sd**2, self.noise.position_sd**2], 3))
         self._start: State | None = None
+        self._held: _Held | None = None
+        self._system: LeastSquares | None = None
         self._select(self.clock.offset)
 
     # ---- the protocol of a nonlinear problem -----------------------------------------------------------------
 
     def initial_state(self) -> State:
         """Wahba on relative rotations, means and linear least squares for the rest (mathematics 2.3); a refined problem goes on."""
-        if self._start is not None:
-            return dict(self._start)
-        return self._known(start_state(self._coupling, self._samples, self.clock.offset))
+        if self._start is None:
+            self._start = self._known(start_state(self._coupling, self._samples, self.clock.offset))
+            self._held = self._hold(self._start)
+        return dict(self._start)
 
     def linearize(self, state: State) -> LeastSquares:
         """Six rows a sample, [rotation; position] in the hand frame, and one row a component with a prior."""
         if self._system is None:
-            self._system = self._pattern()
-        residual, jacobian = self._rows(state)
-        blocks = {v.name: jacobian[:, :, COLUMNS[v.name]].reshape(-1, v.size) for v in self.variables}
-        self._system.set_term("pose", blocks, -residual.ravel())
-        for name in self._priors():
-            slope, error = self._prior_error(name, state)
-            self._system.set_term(f"prior of {name}", {name: slope}, -error)
+            held = [] if self._held is None else [_held_term(self._held, self.variables)]
+            self._system = LeastSquares(self.variables, [*self._terms(), *held])
+        self._fill(self._system, state)
         return self._system
 
     def retract(self, state: State, step: FloatArray) -> State:
@@ -226,21 +229,29 @@ class GraspPoseFromPoses:
             fresh._system.set_covariance("pose", Covariance.blocks(covariance))
         return fresh
 
-    def score_covariance(self, state: State) -> FloatArray | None:
-        """Covariance (n, n) of the gradient from its scatter over stretches of the recording: errors of real poses persist."""
-        if self.settings.clusters == 0:
-            return None
+    def score_covariance(self, state: State) -> FloatArray:
+        """Covariance (n, n) of the gradient: errors of real poses persist, and their noise looks like motion.
+
+        From the scatter of the gradient over stretches of the recording, widened where most of the information is noise of the poses.
+        """
         system = self.linearize(state)
         weights = system.robust_weights(system.residuals(np.zeros(system.size)))
         matrix, rhs = system.whitened(weights)
         where = system.jacobian.slices["pose"]
-        prior = matrix[where.stop :].toarray()
+        # Behind the poses stand the priors and what is held.
+        rows, other_rows = matrix[where].toarray(), matrix[where.stop :].toarray()
+        prior = other_rows.T @ other_rows
+        information = rows.T @ rows + prior
         cluster = self._clusters()
-        if np.unique(cluster).size < _FEWEST_CLUSTERS:
-            return None
-        return cluster_score_covariance(
-            matrix[where].toarray(), rhs[where], np.repeat(cluster, 6), prior.T @ prior
-        )
+        if self.settings.clusters == 0 or np.unique(cluster).size < _FEWEST_CLUSTERS:
+            score = information
+        else:
+            score = cluster_score_covariance(rows, rhs[where], np.repeat(cluster, 6), prior)
+        noise = self._noise_information(state, weights)
+        if self._held is not None:
+            held = matrix[system.jacobian.slices[_HELD]].toarray()
+            noise = noise + held.T @ held
+        return without_noise_information(score, information, self._known_beforehand(), noise)
 
     def describe_direction(self, variable: Variable, vector: FloatArray) -> str:
         """Words for a direction of the rotation or the lever arm."""
@@ -268,8 +279,9 @@ class GraspPoseFromPoses:
             )
         if spread[0] < _ONE_AXIS * spread[1]:
             return (
-                "The end-effector rotates about one axis only, and a lever arm along that axis cannot be told from a shift of the "
-                "other world. Add a rotation about a second axis."
+                "The end-effector rotates about one axis only: a lever arm along that axis cannot be told from a shift of the other "
+                "world, nor (unless the end-effector also travels) a turn about it from a turn of the other world. Add a rotation about "
+                "a second axis."
             )
         return (
             f"The orientations ({degrees:.2g} deg about their mean) differ too little for the errors of the poses: rotate further, about "
@@ -329,7 +341,7 @@ class GraspPoseFromPoses:
         )
         self._chosen_for = offset
         self._samples: IntArray = self._coupling.usable(offset, self._margin)
-        self._system: LeastSquares | None = None
+        self._system = None
         if self._samples.size < _FEWEST_SAMPLES:
             robot, hand = self._streams
             raise InputError(
@@ -368,11 +380,46 @@ class GraspPoseFromPoses:
         covariance = freedom * (residual * weight[:, None]).T @ residual / weight.sum()
         return np.asarray(0.5 * (covariance + covariance.T) + 1e-12 * np.eye(6))
 
+    def _noise_information(self, state: State, weights: FloatArray | None) -> FloatArray:
+        """Information (n, n) that the noise of the poses only pretends."""
+        state = self._known(state)
+        count = self._samples.size
+        robust = np.ones(count) if weights is None else weights[: 6 * count : 6]
+        whitener = robust[:, None, None] * np.linalg.inv(np.linalg.cholesky(self._covariance))
+        poses = self._coupling.at(self._samples, float(state["time_offset"][0]))
+        out = noise_information(state, poses, self._coupling.robot.noise, self._coupling.hand.noise, whitener)
+        columns = np.concatenate([np.arange(13)[COLUMNS[variable.name]] for variable in self.variables])
+        return out[np.ix_(columns, columns)]
+
+    def _known_beforehand(self) -> FloatArray:
+        """Information (n, n) of the priors, and of what goes without saying: a rotation is within pi, the other world within 100 m."""
+        out = np.zeros(sum(variable.size for variable in self.variables))
+        for name, sd in {
+            "rotation": np.pi,
+            "world_rotation": np.pi,
+            "world_translation": 100.0,
+            **self._priors(),
+        }.items():
+            out[self._columns[name]] += 1.0 / sd**2
+        return np.diag(out)
+
+    def _hold(self, state: State) -> _Held | None:
+        """The start, to be kept along directions that only noise seems to inform: a search along them would never end."""
+        system = LeastSquares(self.variables, self._terms())
+        self._fill(system, state)
+        weights = system.robust_weights(system.residuals(np.zeros(system.size)))
+        information = system.normal_equations(weights)[0].toarray()
+        noise = self._noise_information(state, weights)
+        rows = drowned_directions(information, self._known_beforehand(), noise)
+        return _Held(dict(state), rows) if len(rows) else None
+
     def _clusters(self) -> IntArray:
         """Stretch of equal duration that each sample belongs to."""
         t = self._coupling.sampled.t[self._samples]
         share = (t - t[0]) / max(float(t[-1] - t[0]), 1e-300)
-        return np.minimum((share * self.settings.clusters).astype(np.intp), self.settings.clusters - 1)
+        return np.asarray(
+            np.minimum(share * self.settings.clusters, self.settings.clusters - 1), dtype=np.intp
+        )
 
     def _rotation_spread(self) -> tuple[FloatArray, FloatArray]:
         """Eigenvalues (ascending) and axes of ``I - M'M``, M the mean of ``R_w_r``: information on the lever arm per sample."""
@@ -381,7 +428,7 @@ class GraspPoseFromPoses:
         values, axes = np.linalg.eigh(np.eye(3) - mean.T @ mean)
         return np.maximum(values, 0.0), axes
 
-    def _pattern(self) -> LeastSquares:
+    def _terms(self) -> list[Term]:
         names = tuple(variable.name for variable in self.variables)
         rows = 6 * self._samples.size
         terms = [
@@ -391,7 +438,18 @@ class GraspPoseFromPoses:
         for name, sd in self._priors().items():
             size, unit = units[name]
             terms.append(Term(f"prior of {name}", size, (name,), Covariance.scalar(sd**2), unit=unit))
-        return LeastSquares(self.variables, terms)
+        return terms
+
+    def _fill(self, system: LeastSquares, state: State) -> None:
+        residual, jacobian = self._rows(state)
+        blocks = {v.name: jacobian[:, :, COLUMNS[v.name]].reshape(-1, v.size) for v in self.variables}
+        system.set_term("pose", blocks, -residual.ravel())
+        for name in self._priors():
+            slope, error = self._prior_error(name, state)
+            system.set_term(f"prior of {name}", {name: slope}, -error)
+        if _HELD in system.terms:
+            assert self._held is not None
+            _fill_held(system, self._held, state)
 
     def _priors(self) -> dict[str, float]:
         out = {"translation": self.prior.translation_sd}
@@ -409,6 +467,33 @@ class GraspPoseFromPoses:
         mean = self.prior.translation if name == "translation" else self.clock.offset
         error = np.asarray(state[name] - mean)
         return np.eye(error.size), error
+
+
+@dataclass(frozen=True)
+class _Held:
+    """Directions (k, n) of the tangent space along which the state stays where it was."""
+
+    state: State
+    rows: FloatArray
+
+
+def _held_term(held: _Held, variables: tuple[Variable, ...]) -> Term:
+    names = tuple(variable.name for variable in variables)
+    return Term(_HELD, len(held.rows), names, Covariance.scalar(_HELD_SD**2), unit="")
+
+
+def _fill_held(system: LeastSquares, held: _Held, state: State) -> None:
+    """Rows that pull the state back to where it is held."""
+    blocks, total = {}, np.zeros(len(held.rows))
+    for variable in system.variables:
+        way = variable.local(held.state[variable.name], state[variable.name])
+        slope = (
+            lie.so3_right_jacobian_inverse(way) if variable.manifold == "rotation" else np.eye(variable.size)
+        )
+        part = held.rows[:, system.columns[variable.name]]
+        blocks[variable.name] = part @ slope
+        total += part @ way
+    system.set_term(_HELD, blocks, -total)
 
 
 def _variables(settings: GraspFromPosesSettings) -> tuple[Variable, ...]:

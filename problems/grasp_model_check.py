@@ -17,6 +17,7 @@ import numpy as np
 
 from factorgrasp.problems.grasp_model import GraspModel, quadratic_forms
 from factorgrasp.problems.grasp_noise import BandVariances, NoiseMoments
+from factorgrasp.problems.grasp_system import floored_inverse
 from factorgrasp.problems.grasp_windows import Moments
 from factorgrasp.typing import FloatArray, IntArray, State
 
@@ -63,7 +64,7 @@ class ModelCheck:
         """Meat of the sandwich that gives the widened covariance with this information matrix."""
         if self.passed:
             return meat
-        bread = np.linalg.inv(information)
+        bread = floored_inverse(information)
         root = np.sqrt(self.scale)
         covariance = root[:, None] * (bread @ meat @ bread) * root
         where = self.translation
@@ -165,7 +166,7 @@ def _stretch_scale(
     scores = np.array(
         [quadratic_forms(L_g, J_g, g)[1] + quadratic_forms(L_a, J_a, a)[1] for g, a in zip(Z_g, Z_a, strict=True)]
     )
-    bread = np.linalg.inv(information)
+    bread = floored_inverse(information)
     modelled = np.diag(bread @ meat @ bread)
     for group in (1, 2, 3):
         merged = np.add.reduceat(scores, np.arange(0, count, group), axis=0)
@@ -211,7 +212,7 @@ def _band_excess(
         values = np.linalg.eigvalsh(matrix[where, where])
         if values[0] <= 0.0:
             continue
-        inverse = np.linalg.inv(full)
+        inverse = floored_inverse(full)
         arms.append(-(inverse @ (shared_gradient + gradient))[where])
         covariances.append(inverse[where, where])
     if len(arms) < 2:

@@ -142,7 +142,8 @@ def estimated_variances(
     J_g, J_a = model.jacobians(state)
     dof = moments.dof.sum(axis=0)
     Z_g, Z_a = moments.gyro.sum(axis=0), moments.accelerometer.sum(axis=0)
-    half = np.linalg.cholesky(covariance + 1e-30 * np.eye(covariance.shape[0]))
+    values, vectors = np.linalg.eigh(covariance)
+    half = vectors * np.sqrt(np.maximum(values, 0.0))
     out, powers = [], []
     w_g, w_a = current.weights
     for L, J, Z, prior, weight in ((L_g, J_g, Z_g, declared.gyro, w_g), (L_a, J_a, Z_a, declared.accelerometer, w_a)):

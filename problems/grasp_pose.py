@@ -17,8 +17,10 @@ from factorgrasp.errors import InputError
 from factorgrasp.estimate import Estimate
 from factorgrasp.least_squares import LeastSquares
 from factorgrasp.losses import make_loss
+from factorgrasp.observability import default_words
 from factorgrasp.problems import grasp_words
 from factorgrasp.problems.grasp_estimate import GraspDiagnostics, GraspPoseEstimate
+from factorgrasp.problems.grasp_global import better_rotation, rotation_cost
 from factorgrasp.problems.grasp_kinematics import RobotStream, gap_limit, robot_kinematics
 from factorgrasp.problems.grasp_model import GraspModel, phi_information, quadratic_forms
 from factorgrasp.problems.grasp_model_check import ModelCheck, check_model
@@ -41,6 +43,8 @@ from factorgrasp.problems.grasp_recording import (
 )
 from factorgrasp.problems.grasp_settings import GraspNoise, GraspPrior, GraspSettings
 from factorgrasp.problems.grasp_system import (
+    SENSOR_ERRORS,
+    floored_inverse,
     grasp_variables,
     insignificant,
     least_squares_pattern,
@@ -55,10 +59,12 @@ from factorgrasp.typing import FloatArray, State
 
 # Stretches whose scores are compared by the model check: enough for a test, long enough to see slow drifts.
 STRETCHES = 12
-# A remaining offset this small changes no signal below 50 Hz by more than 1 %.
-SETTLED_OFFSET = 3e-5
-# Weights that change by less than this are settled.
+# The model is linear in the remaining offset; at this size the neglected second order is below 1e-4 of any signal up to 20 Hz.
+SETTLED_OFFSET = 1e-4
+# Weights that change by less than this are settled, and so are estimates that new weights move by less than this many standard deviations.
 SETTLED_WEIGHTS = 0.02
+SETTLED_STEP = 0.02
+SETTLED_ROBUST_STEP = 0.1
 MOST_RATE_RATIO = 20.0
 
 
@@ -136,7 +142,9 @@ class GraspPose:
         self.clock = self._search_clock(motion)
         tilt = tilt_axes(self.gravity) if self.settings.base_tilt else None
         self._grid = coupling_grid(motion, hand.rate, bandwidth, self.settings.window, tilt)
-        self.model = GraspModel(*grasp_variables(self.noise, self.settings))
+        # Where the two sides do not turn together, clocks and sensor errors would only chase noise.
+        hopeless = frozenset((*SENSOR_ERRORS, "time_offset")) if self.clock.correlation < SMALLEST_CORRELATION else frozenset()
+        self.model = GraspModel(*grasp_variables(self.noise, self.settings, hopeless))
         self._windows = self._couple(self.clock.offset)
         self._expected: NoiseMoments = noise_moments(
             motion.noise(self._grid.windowing.frequencies),
@@ -151,6 +159,7 @@ class GraspPose:
         self._moments = self._compress()
         self._pattern: LeastSquares | None = None
         self._start: State | None = None
+        self._trust: FloatArray | None = None
         self._pruned = False
 
     # ---- the protocol of a nonlinear problem -----------------------------------------------------------------
@@ -160,11 +169,7 @@ class GraspPose:
         if self._start is not None:
             return self._start
         gain = np.tensordot(self._weights.variances.weights[0], self._moments.gyro.sum(axis=0), 1)
-        rotation = wahba_start(gain[:3, 3:6], self.prior)
-        state = {variable.name: np.zeros(variable.size) for variable in self.model.variables}
-        state["rotation"] = rotation
-        state["translation"] = self.prior.translation.copy()
-        return state
+        return {**self._blank_state(), "rotation": wahba_start(gain[:3, 3:6], self.prior)}
 
     def linearize(self, state: State) -> LeastSquares:
         """Compressed rows: ``e = L(x) S`` with ``S S'`` the weighted, noise-corrected moments, and one row a prior component."""
@@ -180,10 +185,8 @@ class GraspPose:
             blocks = {v: rows[self.model.columns[v]].reshape(-1, term.rows).T for v in term.variables}
             self._pattern.set_term(name, blocks, -(L @ root).ravel())
         for variable in self.model.variables:
-            name = f"prior of {variable.name}"
-            if name in self._pattern.terms:
-                jacobian, value = prior_residual(variable, state, self.prior)
-                self._pattern.set_term(name, {variable.name: jacobian}, -value)
+            jacobian, value = prior_residual(variable, state, self.prior)
+            self._pattern.set_term(f"prior of {variable.name}", {variable.name: jacobian}, -value)
         return self._pattern
 
     def retract(self, state: State, step: FloatArray) -> State:
@@ -194,6 +197,9 @@ class GraspPose:
         """The problem with clocks shifted by the offset found and bands re-weighted by their residual power; None when settled."""
         shift = float(state["time_offset"][0]) if "time_offset" in state else 0.0
         moved = abs(shift) > SETTLED_OFFSET
+        settled = SETTLED_STEP if self.settings.loss == "none" else SETTLED_ROBUST_STEP
+        if not moved and self._start is not None and self._moved(self._start, state) < settled:
+            return self._without_sensor_errors(state)
         out = copy.copy(self)
         if moved:
             offset = self._weights.time_offset + shift
@@ -208,13 +214,17 @@ class GraspPose:
             state,
             out._moments,
             self.declared,
-            np.linalg.inv(self._information(state)),
+            floored_inverse(self._information(state)),
             self._weights.variances,
             self.settings.adapt_noise,
         )
         windows = out._forgetting()
         if robust is not None:
             trust = robust.weight(out._window_norms(state, variances))
+            if self._trust is not None and self._trust.size == trust.size:
+                # Redescending losses otherwise hop between two sets of windows.
+                trust = np.sqrt(trust * self._trust)
+            out._trust = trust
             windows = trust if windows is None else windows * trust
         changed = variances.change_from(self._weights.variances) > SETTLED_WEIGHTS
         if robust is not None:
@@ -228,12 +238,29 @@ class GraspPose:
         out._start = dict(state)
         return out
 
+    def escape(self, state: State) -> State | None:
+        """A start in the basin of a better rotation, or None when this one is the global optimum or nothing better is found."""
+        Q = rotation_cost(
+            self.model,
+            state,
+            *(_projected(Z) for Z in self.corrected_moments()),
+            prior_precision(self.model, self.noise, self.prior),
+            self.prior,
+        )
+        rotation = better_rotation(Q, state["rotation"])
+        return None if rotation is None else {**self._blank_state(), "rotation": rotation}
+
     def score_covariance(self, state: State) -> FloatArray:
         """Covariance (n, n) of the gradient: sandwich meat of noise-corrected, forgetting and robust weights, and of model error.
 
         With the uncorrected, squared-weight moments it is what the noise model says. Where stretches of the recording or bands of
         frequency disagree significantly more, the affected unknowns are widened to that disagreement.
         """
+        if self.clock.correlation < SMALLEST_CORRELATION:
+            # Robot and hand are not seen to turn together: noise alone shaped this state, and nothing of the grasp is known.
+            H = self._information(state)
+            known = np.linalg.inv(np.diag(prior_precision(self.model, self.noise, self.prior)))
+            return np.asarray(H @ known @ H)
         meat = self._model_meat(state)
         return meat if not self.settings.check_model else self.check(state).widened(self._information(state), meat)
 
@@ -253,7 +280,9 @@ class GraspPose:
         )
 
     def describe_direction(self, variable: Any, vector: FloatArray) -> str:
-        """Words for a direction of the rotation or the lever arm."""
+        """Words for a direction of an unknown."""
+        if variable.name not in ("rotation", "translation"):
+            return default_words(variable, vector)
         return grasp_words.direction(variable.name, vector, self._grid.rate_moment)
 
     @property
@@ -339,15 +368,26 @@ class GraspPose:
         """The same problem less those sensor errors that turned out to be nothing; None when there are none to drop."""
         if self.settings.sensor_errors != "auto" or self._pruned:
             return None
-        bread = np.linalg.inv(self._information(state))
+        bread = floored_inverse(self._information(state))
         drop = insignificant(self.model.variables, state, bread @ self._model_meat(state) @ bread)
         if not drop:
             return None
         out = copy.copy(self)
-        out.model = GraspModel(*grasp_variables(self.noise, self.settings, drop))
+        out.model = GraspModel(*grasp_variables(self.noise, self.settings, drop | set(self.model.fixed)))
         out._pruned, out._pattern = True, None
         out._start = {variable.name: state[variable.name] for variable in out.model.variables}
         return out
+
+    def _moved(self, before: State, after: State) -> float:
+        """Largest change of an unknown in standard deviations."""
+        sd = np.sqrt(np.diag(floored_inverse(self._information(after))))
+        steps = [v.local(before[v.name], after[v.name]) / sd[self.model.columns[v.name]] for v in self.model.variables]
+        return float(np.max(np.abs(np.concatenate(steps))))
+
+    def _blank_state(self) -> dict[str, FloatArray]:
+        state = {variable.name: np.zeros(variable.size) for variable in self.model.variables}
+        state["translation"] = self.prior.translation.copy()
+        return state
 
     def _search_clock(self, motion: Any) -> ClockSearch:
         guess = self.settings.time_offset_guess
@@ -431,7 +471,8 @@ def _projected(Z: FloatArray) -> FloatArray:
 
 
 def _rms(x: FloatArray) -> float:
-    rows = x[np.isfinite(x).all(axis=1)]
+    rows = x[:: max(1, x.shape[0] // 5000)]
+    rows = rows[np.isfinite(rows).all(axis=1)]
     return float(np.sqrt(np.mean(np.sum((rows - rows.mean(axis=0)) ** 2, axis=1)))) if rows.size else 0.0
 
 

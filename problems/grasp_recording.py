@@ -8,7 +8,7 @@ import numpy as np
 
 from factorgrasp import signals
 from factorgrasp.errors import InputError
-from factorgrasp.problems.grasp_kinematics import RobotKinematics, gap_limit
+from factorgrasp.problems.grasp_kinematics import RobotKinematics, gap_limit, uniform_grid
 from factorgrasp.problems.grasp_model import VECH
 from factorgrasp.problems.grasp_windows import Windowing, finite_windows
 from factorgrasp.recordings import ImuStream
@@ -16,6 +16,10 @@ from factorgrasp.typing import BoolArray, FloatArray
 
 # Below this the two angular rates are not the same motion at any offset.
 SMALLEST_CORRELATION = 0.5
+# Steps by which two uniform clocks may drift apart over a recording and still be called the same grid.
+_DRIFT = 1e-3
+# Samples a second that z keeps for every Hz of bandwidth; enough that vibration does not fold into the band.
+_RATE_OVER_BANDWIDTH = 10.0
 
 
 @dataclass(frozen=True)
@@ -25,6 +29,7 @@ class HandSignals:
     t: FloatArray
     both: FloatArray
     limit: float
+    uniform: bool
 
     @property
     def angular_velocity(self) -> FloatArray:
@@ -36,13 +41,41 @@ class HandSignals:
         """Samples as they are; only rows with a NaN become gaps as a whole."""
         both = np.hstack([hand.angular_velocity, hand.specific_force])
         both[~hand.valid] = np.nan
-        return cls(hand.t, both, gap_limit(hand.t, max_gap))
+        return cls(hand.t, both, gap_limit(hand.t, max_gap), uniform_grid(hand.t)[1])
 
     def at(self, times: FloatArray) -> FloatArray:
-        """Angular velocity and specific force (n, 6) at other times of the hand's clock; NaN in gaps and outside."""
-        if times.size == self.t.size and np.max(np.abs(times - self.t)) < 1e-9:
-            return self.both
+        """Angular velocity and specific force (n, 6) at other, uniform times of the hand's clock; NaN in gaps and outside."""
+        if self.uniform:
+            step = (self.t[-1] - self.t[0]) / (self.t.size - 1)
+            first, last = (times[0] - self.t[0]) / step, (times[-1] - self.t[0]) / step
+            if abs((last - first) - (times.size - 1)) < _DRIFT:
+                return _shifted(self.both, 0.5 * (first + last - (times.size - 1)), times.size)
         return signals.resample_uniform(self.t, self.both, times, max_gap=self.limit, kind="cubic")[1]
+
+
+def _shifted(x: FloatArray, start: float, count: int) -> FloatArray:
+    """Rows ``start, start + 1, ...`` of x (n, c), `start` not whole, by the four-point Lagrange polynomial; NaN where it lacks a row."""
+    whole = int(np.floor(start + 1e-9))
+    u = start - whole
+    out = np.full((count, x.shape[1]), np.nan)
+    if abs(u) < 1e-6:
+        low, high = max(0, -whole), min(count, x.shape[0] - whole)
+        if high > low:
+            out[low:high] = x[low + whole : high + whole]
+        return out
+    weights = (
+        -u * (u - 1.0) * (u - 2.0) / 6.0,
+        (u + 1.0) * (u - 1.0) * (u - 2.0) / 2.0,
+        -(u + 1.0) * u * (u - 2.0) / 2.0,
+        (u + 1.0) * u * (u - 1.0) / 6.0,
+    )
+    low, high = max(0, 1 - whole), min(count, x.shape[0] - whole - 2)
+    if high > low:
+        part = weights[0] * x[low + whole - 1 : high + whole - 1]
+        for offset in (0, 1, 2):
+            part += weights[offset + 1] * x[low + whole + offset : high + whole + offset]
+        out[low:high] = part
+    return out
 
 
 @dataclass(frozen=True)
@@ -66,10 +99,15 @@ class CoupledWindows:
 
 @dataclass(frozen=True)
 class CouplingGrid:
-    """The robot side on the common grid, ready to be coupled with the hand at any time offset."""
+    """The robot side on the common grid, ready to be coupled with the hand at any time offset.
+
+    Products are formed at the full rate; then every entry of z is averaged over `averaged` samples, which keeps the relations exact and the
+    windows short.
+    """
 
     t: FloatArray
-    angular_velocity: FloatArray
+    fine: FloatArray
+    averaged: int
     coefficients: FloatArray
     windowing: Windowing
     tilted: bool
@@ -78,7 +116,7 @@ class CouplingGrid:
 
     def couple(self, hand: HandSignals, time_offset: float) -> CoupledWindows:
         """Windows of z with the hand's signals read at ``t + time_offset``."""
-        values = hand.at(self.t + time_offset)
+        values = average(hand.at(self.fine + time_offset), self.averaged)
         step = self.windowing.step
         slope = np.full_like(values, np.nan)
         slope[1:-1] = (values[2:] - values[:-2]) / (2.0 * step)
@@ -94,6 +132,14 @@ class CouplingGrid:
         accelerometer = np.concatenate(parts, axis=3)
         centres = self.t[0] + self.windowing.centres(good.size)
         return CoupledWindows(gyro, accelerometer, centres[good], int(np.count_nonzero(~good)))
+
+
+def average(x: FloatArray, samples: int) -> FloatArray:
+    """Means (n // samples, c) of consecutive samples of x (n, c); a NaN spoils its mean."""
+    if samples == 1:
+        return x
+    count = x.shape[0] // samples
+    return np.asarray(x[: count * samples].reshape(count, samples, -1).mean(axis=1))
 
 
 def vech_products(w: FloatArray) -> FloatArray:
@@ -141,13 +187,17 @@ def coupling_grid(
         t = robot.t[0] + np.arange(int((robot.t[-1] - robot.t[0]) * hand_rate) + 1) / hand_rate
         z = signals.resample_uniform(robot.t, z, t, max_gap=1.6 * robot.step, kind="cubic")[1]
     step = float((t[-1] - t[0]) / (t.size - 1))
-    windowing = Windowing.for_grid(step, window, bandwidth, t.size)
+    averaged = max(1, int(1.0 / (step * _RATE_OVER_BANDWIDTH * bandwidth)))
+    z, fine = average(z, averaged), t
+    t = average(t[:, None], averaged)[:, 0]
+    windowing = Windowing.for_grid(averaged * step, window, bandwidth, t.size)
     rows = z[np.isfinite(z).all(axis=1)]
     if rows.shape[0] == 0:
         raise InputError("robot", "at least one stretch without gaps", "none: every differentiation window touches a gap")
     return CouplingGrid(
         t=t,
-        angular_velocity=z[:, :3],
+        fine=fine,
+        averaged=averaged,
         coefficients=windowing.transform(z),
         windowing=windowing,
         tilted=tilt is not None,
@@ -197,14 +247,38 @@ def search_time_offset(
     y = signals.resample_uniform(hand.t, hand.angular_velocity, hand_grid, max_gap=max(hand.limit, 1.1 * step))[1]
     correlations = _rotation_invariant_correlation(x, y)
     lags = guess - reach + step * np.arange(correlations.size)
-    if not np.isfinite(correlations).any():
+    if correlations.size == 0 or not np.any(np.isfinite(y)):
         raise InputError(
             "robot and hand",
             "recordings that overlap in time",
             f"robot {robot.t[0]:.6g} to {robot.t[-1]:.6g} s, hand {hand.t[0]:.6g} to {hand.t[-1]:.6g} s",
             "Put both on one time base, or widen estimate.max_time_offset",
         )
-    return _best_peak(lags, np.where(np.isfinite(correlations), correlations, -1.0), guess, step)
+    if not np.isfinite(correlations).any():
+        # One side does not rotate at all: no offset can be found, and none matters.
+        return ClockSearch(guess, 0.0, 1.0)
+    found = _best_peak(lags, np.where(np.isfinite(correlations), correlations, -1.0), guess, step)
+    if reach < step or found.correlation < SMALLEST_CORRELATION:
+        return found
+    return _sharpened(found, grid, x, hand, step)
+
+
+def _sharpened(found: ClockSearch, grid: FloatArray, x: FloatArray, hand: HandSignals, step: float) -> ClockSearch:
+    """One Gauss-Newton step on the offset with the best rotation and bias held: the parabola through the peak is a few tenths of a step off."""
+    y = signals.resample_uniform(
+        hand.t, hand.angular_velocity, grid + found.offset, max_gap=max(hand.limit, 1.1 * step), kind="cubic"
+    )[1]
+    slope = np.full_like(y, np.nan)
+    slope[1:-1] = (y[2:] - y[:-2]) / (2.0 * step)
+    good = np.isfinite(x).all(axis=1) & np.isfinite(slope).all(axis=1) & np.isfinite(y).all(axis=1)
+    if np.count_nonzero(good) < 16:
+        return found
+    a, b, d = (part[good] - part[good].mean(axis=0) for part in (x, y, slope))
+    U, _, Vt = np.linalg.svd(a.T @ b)
+    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    turned = d @ R.T
+    shift = float(np.sum(turned * (a - b @ R.T)) / max(np.sum(turned**2), 1e-300))
+    return ClockSearch(found.offset + float(np.clip(shift, -step, step)), found.correlation, found.ambiguity)
 
 
 def _rotation_invariant_correlation(x: FloatArray, y: FloatArray) -> FloatArray:

@@ -12,6 +12,8 @@ from factorgrasp.typing import FloatArray, State
 from factorgrasp.uncertainty import Covariance
 from factorgrasp.variables import Variable, slices
 
+# rad; a prior this wide says nothing of a rotation, but keeps the system regular where no motion does either.
+_NO_KNOWLEDGE = np.pi
 SENSOR_ERRORS = ("accelerometer_delay", "gyro_calibration", "accelerometer_calibration")
 
 
@@ -55,10 +57,10 @@ def grasp_variables(
     return chosen, fixed
 
 
-def prior_sd(noise: GraspNoise, prior: GraspPrior, name: str) -> float | None:
-    """Prior standard deviation of every component of an unknown; None where there is none."""
+def prior_sd(noise: GraspNoise, prior: GraspPrior, name: str) -> float:
+    """Prior standard deviation of every component of an unknown."""
     return {
-        "rotation": prior.rotation_sd,
+        "rotation": _NO_KNOWLEDGE if prior.rotation_sd is None else prior.rotation_sd,
         "translation": prior.translation_sd,
         "gyro_bias": noise.gyro_bias_sd,
         "accelerometer_bias": noise.accelerometer_bias_sd,
@@ -74,17 +76,14 @@ def prior_precision(model: GraspModel, noise: GraspNoise, prior: GraspPrior) -> 
     """Diagonal of the prior information (n,)."""
     out = np.zeros(model.size)
     for variable in model.variables:
-        sd = prior_sd(noise, prior, variable.name)
-        if sd is not None:
-            out[model.columns[variable.name]] = 1.0 / sd**2
+        out[model.columns[variable.name]] = 1.0 / prior_sd(noise, prior, variable.name) ** 2
     return out
 
 
 def prior_residual(variable: Variable, state: State, prior: GraspPrior) -> tuple[FloatArray, FloatArray]:
     """Jacobian (size, size) and residual (size,) of a variable against its prior mean (zero but for the grasp itself)."""
     if variable.name == "rotation":
-        assert prior.rotation is not None
-        error = lie.so3_log(prior.rotation.T @ state["rotation"])
+        error = lie.so3_log(state["rotation"] if prior.rotation is None else prior.rotation.T @ state["rotation"])
         return lie.so3_right_jacobian_inverse(error), error
     mean = prior.translation if variable.name == "translation" else 0.0
     return np.eye(variable.size), state[variable.name] - mean
@@ -113,10 +112,8 @@ def least_squares_pattern(model: GraspModel, precision: FloatArray) -> LeastSqua
         ),
     ]
     for variable in model.variables:
-        values = precision[model.columns[variable.name]]
-        if values[0] > 0.0:
-            covariance = Covariance.diagonal(1.0 / values)
-            terms.append(Term(f"prior of {variable.name}", variable.size, (variable.name,), covariance, unit=variable.unit))
+        covariance = Covariance.diagonal(1.0 / precision[model.columns[variable.name]])
+        terms.append(Term(f"prior of {variable.name}", variable.size, (variable.name,), covariance, unit=variable.unit))
     return LeastSquares(model.variables, terms)
 
 
@@ -125,7 +122,8 @@ def positive_part(Z: FloatArray) -> FloatArray:
 
     Taking the expected noise out can leave small negative eigenvalues where nothing excites; they carry no information.
     """
-    scale = np.sqrt(np.maximum(np.diag(Z), 1e-300))
+    diagonal = np.diag(Z)
+    scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     values, vectors = np.linalg.eigh(Z / np.outer(scale, scale))
     return np.asarray((scale[:, None] * vectors) * np.sqrt(np.maximum(values, 0.0)))
 
@@ -151,3 +149,11 @@ def insignificant(variables: tuple[Variable, ...], state: State, covariance: Flo
             if value @ np.linalg.solve(part, value) < chi2.ppf(0.999, variable.size):
                 out.add(variable.name)
     return frozenset(out)
+
+
+def floored_inverse(H: FloatArray) -> FloatArray:
+    """Inverse (n, n) of an information matrix; what holds no information gets a huge variance instead of an error."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(H), 1e-12))
+    values, vectors = np.linalg.eigh(scale[:, None] * H * scale)
+    root = (scale[:, None] * vectors) / np.sqrt(np.maximum(values, 1e-13 * values[-1]))
+    return np.asarray(root @ root.T)

@@ -59,3 +59,15 @@ def advice(rate_moment: FloatArray, robot: object) -> str:
     if isinstance(robot, PoseStream) and robot.rate < 200.0:
         words += " Poses sampled or interpolated from few samples a second carry no acceleration: record the robot side faster."
     return words
+
+
+def unrelated(correlation: float, rate_moment: FloatArray) -> str:
+    """What it may mean that the two angular rates do not correlate."""
+    speed = float(np.sqrt(max(np.trace(rate_moment), 0.0)))
+    if speed < 0.05:
+        return f"The end-effector hardly rotates ({np.degrees(speed):.2g} deg/s rms), so nothing ties the hand's motion to it."
+    return (
+        f"Robot and hand do not turn together (correlation of their angular rates {correlation:.2f} at the best offset): the recordings may not "
+        "belong to the same motion, the clocks may differ by more than max_time_offset, or the quaternions may be in another order or direction "
+        "than w, x, y, z body-to-world."
+    )

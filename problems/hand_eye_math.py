@@ -7,13 +7,13 @@ Robot poses ``(R_w_r, p_w_r)`` and hand poses ``(R_t_h, p_t_h)`` in another worl
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from factorgrasp import lie
 from factorgrasp.errors import InputError
-from factorgrasp.problems.grasp_kinematics import gap_limit
+from factorgrasp.problems.grasp_kinematics import gap_limit, white_noise_sd
 from factorgrasp.recordings import PoseStream
 from factorgrasp.typing import BoolArray, FloatArray, IntArray, State
 
@@ -29,6 +29,8 @@ COLUMNS = {
 # Relative motions over this time (s) tell more than the noise of two camera poses and still less than a turn.
 _PAIR_SECONDS = 0.5
 _MOST_PAIRS = 800
+# Nobody's hand makes a corner in this time (s).
+_LONGEST_SMOOTHING = 0.1
 _COARSE_STEP, _FINE_STEP = 0.02, 0.002
 # A second singular value of the relative rotations below this part of the first: they share one axis.
 _ONE_AXIS = 0.02
@@ -46,7 +48,7 @@ def apply(R: FloatArray, v: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class CurvePoints:
-    """Poses between samples: great arcs and straight lines, with the velocities of that motion.
+    """Poses between samples, with the velocities of that motion.
 
     Attributes
     ----------
@@ -69,40 +71,86 @@ class CurvePoints:
 
 @dataclass(frozen=True)
 class PoseCurve:
-    """The complete samples of a pose stream; `stretch` (n,) counts the stretches without gaps."""
+    """A smooth curve by the complete samples of a pose stream, in stretches without gaps.
+
+    At a sample: pose and velocity of the parabola fitted to the `half_width` samples on either side (1: through the sample itself).
+    Between samples: the cubic with these ends (Hermite), rotations in rotation vectors from the sample before. Straight lines and
+    great arcs would leave velocities that jump at every sample, and noisy samples an interpolated noise that is smallest between two of
+    them: either way the time offset goes astray.
+
+    Attributes
+    ----------
+    t : (n,) ndarray
+        s.
+    rotation, position : (n, 3, 3) and (n, 3) ndarray
+    angular_velocity, velocity : (n, 3) ndarray
+        Body frame rad/s, world frame m/s.
+    stretch : (n,) ndarray of int
+        Counts the stretches without gaps.
+    step : float
+        Median step of the stream, s.
+    noise : (2, 2) ndarray
+        White noise of [rotation; position] (rad, m) and of their velocities (rad/s, m/s) per axis.
+    """
 
     t: FloatArray
     rotation: FloatArray
     position: FloatArray
+    angular_velocity: FloatArray
+    velocity: FloatArray
     stretch: IntArray
     step: float
+    noise: FloatArray
 
     @classmethod
-    def from_stream(cls, stream: PoseStream, max_gap: float | None) -> PoseCurve:
-        """Incomplete rows are left out; what is then further apart than the limit is a gap."""
+    def from_stream(cls, stream: PoseStream, max_gap: float | None, smooth: bool = False) -> PoseCurve:
+        """Incomplete rows are left out; what is then further apart than the limit is a gap.
+
+        With `smooth`, the parabolas are as wide as the noise needs for velocities of a fifth of the motion's, at most 0.1 s.
+        """
         good = stream.valid
-        t = stream.t[good]
+        t, R, p = stream.t[good], stream.rotation[good], stream.position[good]
         if t.size < 2:
             raise InputError(stream.name, "at least two complete poses", str(t.size))
-        limit = gap_limit(stream.t, max_gap)
-        stretch = np.concatenate([[0], np.cumsum(np.diff(t) > limit)]).astype(np.intp)
-        return cls(t, stream.rotation[good], stream.position[good], stretch, stream.step)
+        stretch = np.concatenate([[0], np.cumsum(np.diff(t) > gap_limit(stream.t, max_gap))]).astype(np.intp)
+        # What is too fast to be motion.
+        sd = np.array([2.0 * white_noise_sd(stream.rotation_wxyz), white_noise_sd(stream.position)])
+        half = _half_width(R, p, stream.step, sd) if smooth else 1
+        fit, rates = _local_parabolas(t, R, p, stretch, half)
+        turn = fit[:, :3]
+        squares = np.arange(-half, half + 1.0) ** 2
+        # Variance of the middle and of the slope of a parabola fitted to uniform samples.
+        middle = (squares**2).sum() / (squares.size * (squares**2).sum() - squares.sum() ** 2)
+        slope = 1.0 / squares.sum() / stream.step**2
+        return cls(
+            t,
+            R @ lie.so3_exp(turn),
+            p + fit[:, 3:],
+            apply(lie.so3_right_jacobian(turn), rates[:, :3]),
+            rates[:, 3:],
+            stretch,
+            stream.step,
+            np.stack([sd * np.sqrt(middle), sd * np.sqrt(slope)]),
+        )
 
     def at(self, times: FloatArray) -> CurvePoints:
         """Interpolated poses; outside of stretches the values mean nothing and `inside` is False."""
         i = np.clip(np.searchsorted(self.t, times, side="right") - 1, 0, self.t.size - 2)
-        h = self.t[i + 1] - self.t[i]
-        u = (times - self.t[i]) / h
-        inside = (u >= 0.0) & (u <= 1.0) & (self.stretch[i] == self.stretch[i + 1])
-        u = np.clip(u, 0.0, 1.0)[:, None]
+        h = (self.t[i + 1] - self.t[i])[:, None]
+        u = (times[:, None] - self.t[i, None]) / h
+        inside = (u[:, 0] >= 0.0) & (u[:, 0] <= 1.0) & (self.stretch[i] == self.stretch[i + 1])
+        u = np.clip(u, 0.0, 1.0)
         turn = lie.so3_log(transposed(self.rotation[i]) @ self.rotation[i + 1])
+        leaving = h * self.angular_velocity[i]
+        arriving = h * apply(lie.so3_right_jacobian_inverse(turn), self.angular_velocity[i + 1])
+        phi, phi_slope = _hermite(u, turn, leaving, arriving)
         way = self.position[i + 1] - self.position[i]
-        rate = 1.0 / h[:, None]
+        moved, moved_slope = _hermite(u, way, h * self.velocity[i], h * self.velocity[i + 1])
         return CurvePoints(
-            self.rotation[i] @ lie.so3_exp(u * turn),
-            self.position[i] + u * way,
-            turn * rate,
-            way * rate,
+            self.rotation[i] @ lie.so3_exp(phi),
+            self.position[i] + moved,
+            apply(lie.so3_right_jacobian(phi), phi_slope) / h,
+            moved_slope / h,
             inside,
         )
 
@@ -114,6 +162,52 @@ class PoseCurve:
         return np.asarray(
             within & (self.stretch[np.maximum(first, 0)] == self.stretch[np.minimum(last, self.t.size - 1)])
         )
+
+
+def _half_width(R: FloatArray, p: FloatArray, step: float, sd: FloatArray) -> int:
+    """Samples on either side that a parabola needs for velocities with a fifth of the motion's rms as noise."""
+    most = max(1, int(_LONGEST_SMOOTHING / step))
+    lag = min(most, len(p) - 1)
+    moved = np.stack([lie.so3_log(transposed(R[:-lag]) @ R[lag:]), p[lag:] - p[:-lag]])
+    motion = np.sqrt(np.maximum((moved**2).sum(axis=2).mean(axis=1) - 6.0 * sd**2, 0.0)) / lag
+    half = 1
+    while half < most and np.any(
+        np.sqrt(3.0 / (half * (half + 1) * (2 * half + 1) / 3.0)) * sd > 0.2 * motion
+    ):
+        half += 1
+    return half
+
+
+def _local_parabolas(
+    t: FloatArray, R: FloatArray, p: FloatArray, stretch: IntArray, half: int
+) -> tuple[FloatArray, FloatArray]:
+    """Middle (n, 6), relative to the sample, and slope (n, 6) of parabolas in [rotation vector; position]."""
+    n = t.size
+    index = np.arange(n)[:, None] + np.arange(-half, half + 1)
+    inside = (index >= 0) & (index < n)
+    index = np.clip(index, 0, n - 1)
+    inside &= stretch[index] == stretch[:, None]
+    turn = lie.so3_log(transposed(R)[:, None] @ R[index])
+    values = np.concatenate([turn, p[index] - p[:, None]], axis=2)
+    scale = half * float(np.median(np.diff(t)))
+    x = (t[index] - t[:, None]) / scale
+    design = np.stack([np.ones_like(x), x, x * x], axis=2) * inside[:, :, None]
+    normal = transposed(design) @ design
+    # Two samples make a line, a lonely one stands still: hardly any curvature or slope is as good as none.
+    normal[:, 1, 1] += 1e-12
+    normal[:, 2, 2] += 1e-10
+    fit = np.linalg.solve(normal, transposed(design) @ values)
+    return fit[:, 0], fit[:, 1] / scale
+
+
+def _hermite(
+    u: FloatArray, way: FloatArray, leaving: FloatArray, arriving: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Cubic from 0 (u = 0) to `way` (u = 1) with the given slopes in u, and its slope."""
+    rest = 1.0 - u
+    value = (3.0 - 2.0 * u) * u**2 * way + u * rest**2 * leaving - u**2 * rest * arriving
+    slope = 6.0 * u * rest * way + rest * (1.0 - 3.0 * u) * leaving + u * (3.0 * u - 2.0) * arriving
+    return value, slope
 
 
 @dataclass(frozen=True)
@@ -149,6 +243,15 @@ class PoseCoupling:
 
     robot: PoseCurve
     hand: PoseCurve
+
+    @classmethod
+    def from_streams(cls, robot: PoseStream, hand: PoseStream, max_gap: float | None) -> PoseCoupling:
+        """Only the interpolated side is smoothed: its samples in between are there to be used, too."""
+        at_hand = hand.step >= robot.step
+        return cls(
+            PoseCurve.from_stream(robot, max_gap, smooth=at_hand),
+            PoseCurve.from_stream(hand, max_gap, smooth=not at_hand),
+        )
 
     @property
     def at_hand(self) -> bool:
@@ -227,6 +330,37 @@ def coupling_rows(state: State, poses: CoupledPoses) -> tuple[FloatArray, FloatA
     residual[outside] = 0.0
     jacobian[outside] = 0.0
     return residual, jacobian
+
+
+def noise_information(
+    state: State, poses: CoupledPoses, robot_noise: FloatArray, hand_noise: FloatArray, whitener: FloatArray
+) -> FloatArray:
+    """Information (13, 13) that noise of the poses adds by shaking the Jacobian: ``sum dJ' W' W dJ`` for one draw of such noise.
+
+    Parameters
+    ----------
+    robot_noise, hand_noise : (2, 2) ndarray
+        As :attr:`PoseCurve.noise`.
+    whitener : (n, 6, 6) ndarray
+        ``W`` of every sample, robust weights included.
+    """
+    rng = np.random.default_rng(0)
+
+    def draw(sd: FloatArray) -> FloatArray:
+        return np.asarray(np.repeat(sd, 3) * rng.standard_normal((len(poses.robot_position), 6)))
+
+    robot, hand = draw(robot_noise[0]), draw(hand_noise[0])
+    shaken = replace(
+        poses,
+        robot_rotation=poses.robot_rotation @ lie.so3_exp(robot[:, :3]),
+        robot_position=poses.robot_position + robot[:, 3:],
+        hand_rotation=poses.hand_rotation @ lie.so3_exp(hand[:, :3]),
+        hand_position=poses.hand_position + hand[:, 3:],
+        robot_slide=None if poses.robot_slide is None else poses.robot_slide + draw(robot_noise[1]),
+        hand_slide=None if poses.hand_slide is None else poses.hand_slide + draw(hand_noise[1]),
+    )
+    change = (whitener @ (coupling_rows(state, shaken)[1] - coupling_rows(state, poses)[1])).reshape(-1, 13)
+    return np.asarray(change.T @ change)
 
 
 # ---- start --------------------------------------------------------------------------------------------------

@@ -98,7 +98,7 @@ class DenseSystem:
         self._flat = np.repeat(np.arange(rows), np.diff(indptr)) * size + indices
         self._matrix = np.zeros((rows, size))
         self.size = size
-        self.stalled = False
+        self.stalled = self.imprecise = False
         self.stamp = 0
 
     def update(self, entries: FloatArray, rhs: FloatArray, hard: FloatArray, hard_rhs: FloatArray) -> None:

@@ -15,7 +15,7 @@ import scipy.sparse as sp
 from factorgrasp.errors import UnobservableError
 from factorgrasp.least_squares import LeastSquares
 from factorgrasp.solvers.base import Solution
-from factorgrasp.solvers.linear_system import LinearSystem, LinearValues
+from factorgrasp.solvers.linear_system import LinearSystem, LinearValues, System
 from factorgrasp.solvers.null_directions import NullSpace
 from factorgrasp.status import Status
 from factorgrasp.typing import BoolArray, FloatArray, IntArray
@@ -94,13 +94,13 @@ class Factor:
     def solve(self, columns: FloatArray) -> FloatArray:
         """``P B`` (n, k) for B (n, k) or (n,); NaN in a column that reaches into a null direction."""
         columns = np.asarray(columns, dtype=float)
-        out = self._current().system.apply(columns)
+        out = self._system().apply(columns)
         reached = self.null.reaches(columns if columns.ndim == 2 else columns[:, None])
         return np.where(reached if columns.ndim == 2 else reached[0], np.nan, out) if reached.any() else out
 
     def informed_solve(self, columns: FloatArray) -> FloatArray:
         """``P B`` without a look at null directions: right for read-outs that none of them reaches, meaningless for others."""
-        return self._current().system.apply(np.asarray(columns, dtype=float))
+        return self._system().apply(np.asarray(columns, dtype=float))
 
     def marginal(self, indices: IntArray) -> FloatArray:
         """Covariance (k, k) of the unknowns at `indices`; infinite variances and NaN covariances where nothing informs them."""
@@ -115,7 +115,7 @@ class Factor:
     def informed_marginal(self, indices: IntArray) -> FloatArray:
         """The same, but finite: right for every combination of the unknowns that no null direction reaches, meaningless for others."""
         indices = np.asarray(indices, dtype=np.intp)
-        system = self._current().system
+        system = self._system()
         block = system.block(indices)
         if block is None:
             block = system.apply(_unit_columns(self.size, indices))[indices]
@@ -123,17 +123,17 @@ class Factor:
 
     def variances(self) -> FloatArray:
         """Variances of all unknowns (n,) at once, by the selected inverse; infinite where nothing informs them."""
-        out = np.array(self._current().system.variances())
+        out = np.array(self._system().variances())
         out[self.null.reaches_unknowns()] = np.inf
         return out
 
-    def _current(self) -> LinearSystem:
+    def _system(self) -> System:
         """The factored system; made anew when the solver that lent it has gone on to other values."""
         if self._linear.stamp != self._stamp:
             self._linear = self._linear.fresh()
             self._linear.update(self._values)
             self._stamp = self._linear.stamp
-        return self._linear
+        return self._linear.for_covariance(self._values)
 
 
 def posterior_factor(

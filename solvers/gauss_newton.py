@@ -17,6 +17,7 @@ from factorgrasp.solvers.base import Solution, Solver
 from factorgrasp.solvers.damping import Damped
 from factorgrasp.solvers.outer_loop import (
     GOOD_ENOUGH,
+    NO_DAMPING,
     ROUNDING,
     Iteration,
     LoopOptions,
@@ -93,7 +94,7 @@ class GaussNewton:
             penalty = max(penalty, 1.5 * _largest_multiplier(found))
             step = sd_length(system, found.x, point.weights)
             slope = -float(point.weighted_rhs @ (point.weighted @ found.x)) - penalty * point.violation
-            small = step <= smallest_step(options, point.objective) and damping <= 1e-8
+            small = step <= smallest_step(options, point.objective) and damping <= NO_DAMPING
             if small and point.worst_violation <= FEASIBLE:
                 state, system, taken = self._last_step(problem, state, found.x, point, penalty)
                 log.append(Iteration(point.objective, point.violation, step, taken, damping))
@@ -107,7 +108,7 @@ class GaussNewton:
             log.append(Iteration(point.objective, point.violation, step, length, damping))
             if landed is None:
                 system = problem.linearize(state)
-                if step <= GOOD_ENOUGH and point.worst_violation <= 1e-5:
+                if step <= GOOD_ENOUGH and damping <= NO_DAMPING and point.worst_violation <= 1e-5:
                     return end(*_verdict(found, len(log)))
                 if damping > 1e8:
                     words = "stalled: no step decreases the objective although its gradient is not zero"

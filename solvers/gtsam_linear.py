@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from factorgrasp.errors import InputError, SolverError
-from factorgrasp.gtsam_view import GaussianView, variable_of_error
+from factorgrasp.gtsam_view import GaussianView, load_gtsam, variable_of_error
 from factorgrasp.least_squares import LeastSquares
 from factorgrasp.solvers.base import Capabilities, Solution, Solver
 from factorgrasp.status import Status
@@ -21,9 +21,9 @@ _RANK = 1e-13
 class GtsamElimination(Solver):
     """Variable elimination with a cached COLAMD ordering.
 
-    ``extra={"elimination": "qr"}`` (the default) eliminates by Householder QR on the rows themselves, which keeps the digits that the normal
-    equations lose, and names the variable that the data do not inform. ``"cholesky"`` is gtsam's own default (multifrontal); it is up to
-    twice as fast and refuses badly scaled problems, as gtsam takes a pivot 2^-12 below its neighbour for a singular one.
+    ``extra={"elimination": "qr"}`` (the default) eliminates by Householder QR on the rows themselves, which keeps the digits that the
+    normal equations lose, and names the variable that the data do not inform. ``"cholesky"`` is gtsam's own default (multifrontal); it is
+    up to twice as fast and takes badly scaled problems for singular ones (rows of 1e6 beside rows of 1 in one variable).
     """
 
     name: ClassVar[str] = "gtsam"
@@ -32,7 +32,7 @@ class GtsamElimination(Solver):
     capabilities: ClassVar[Capabilities] = Capabilities(equalities=True)
 
     def setup(self, problem: LeastSquares) -> None:
-        """Cut the rows into factors.
+        """Cut the rows into factors; what was cut for the same pattern is kept.
 
         Raises
         ------
@@ -45,12 +45,16 @@ class GtsamElimination(Solver):
         if self._elimination not in ("qr", "cholesky"):
             raise InputError("elimination", "'qr' or 'cholesky'", repr(self._elimination))
         self._problem = problem
+        known: GaussianView | None = getattr(self, "_view", None)
+        if known is not None and known.fits(problem):
+            known.problem = problem
+            return
         self._view = GaussianView(problem)
         self._ordering: Any = None
 
     def solve(self, row_weights: FloatArray | None = None, warm_start: Solution | None = None) -> Solution:
         """Build the graph of the current values and eliminate; `setup_time` holds the building (Python, a few us a factor)."""
-        import gtsam
+        gtsam = load_gtsam()
 
         problem = self._problem
         start = time.perf_counter()
@@ -95,7 +99,9 @@ class GtsamElimination(Solver):
     def _dependent(self, net: Any) -> str:
         """Name of the first variable of which elimination left nothing; empty when there is none."""
         problem = self._problem
-        norms = np.bincount(problem.jacobian.matrix.indices, weights=self._view.entries**2, minlength=problem.size)
+        norms = np.bincount(
+            problem.jacobian.matrix.indices, weights=self._view.entries**2, minlength=problem.size
+        )
         hard = problem.equalities.matrix
         norms = np.sqrt(norms + np.bincount(hard.indices, weights=hard.data**2, minlength=problem.size))
         for i in range(net.size()):
@@ -103,7 +109,11 @@ class GtsamElimination(Solver):
             name = self._view.keys.name[conditional.firstFrontalKey()]
             pivots = np.abs(np.diagonal(conditional.R()))
             # The row of an exact relation is scaled to a unit pivot: it is compared with one.
-            scale = np.minimum(norms[problem.columns[name]], 1.0) if conditional.isConstrained() else norms[problem.columns[name]]
+            scale = (
+                np.minimum(norms[problem.columns[name]], 1.0)
+                if conditional.isConstrained()
+                else norms[problem.columns[name]]
+            )
             if np.any(pivots <= _RANK * scale):
                 return name
         return ""

@@ -16,7 +16,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from factorgrasp.gtsam_view import NonlinearView, variable_of_error
+from factorgrasp.gtsam_nonlinear_view import NonlinearView
+from factorgrasp.gtsam_view import load_gtsam, variable_of_error
 from factorgrasp.problem import NonlinearProblem
 from factorgrasp.solvers.base import Capabilities, NonlinearSolution, SolverOptions
 from factorgrasp.solvers.gtsam_linear import GtsamElimination
@@ -25,6 +26,9 @@ from factorgrasp.typing import State
 
 MAX_ITERATIONS = 100
 _ROUNDING = 1e-15
+_STALLED = 1e-11
+"""Decrement, relative to the objective (at least one), at which a run that can go no further counts as converged: a few millionths of a
+standard deviation, below which the rounding of the objective hides every decrease."""
 
 
 class GtsamNonlinear(GtsamElimination):
@@ -32,7 +36,9 @@ class GtsamNonlinear(GtsamElimination):
 
     capabilities: ClassVar[Capabilities] = Capabilities(equalities=True, nonlinear=True)
 
-    def solve_problem(self, problem: NonlinearProblem, initial_state: State | None = None) -> NonlinearSolution:
+    def solve_problem(
+        self, problem: NonlinearProblem, initial_state: State | None = None
+    ) -> NonlinearSolution:
         """Iterate from the problem's initial state, or another one, to convergence.
 
         Raises
@@ -54,7 +60,10 @@ class GtsamNonlinear(GtsamElimination):
                 raise
             values = run.best if run.best is not None else view.values
             name = variable_of_error(str(error), lambda key: _name_of(view, key))
-            run.end(Status.UNOBSERVABLE, f"the data do not inform {name} (given the other variables): add a measurement or a prior")
+            run.end(
+                Status.UNOBSERVABLE,
+                f"the data do not inform {name} (given the other variables): add a measurement or a prior",
+            )
         return NonlinearSolution(
             state=view.state(values),
             status=run.status,
@@ -81,6 +90,7 @@ class _Run:
         self.iterations = 0
         self.status = Status.NOT_CONVERGED
         self.message = ""
+        self.stalls = 0
         self.best: Any = None
         self._clock = clock
 
@@ -95,6 +105,23 @@ class _Run:
         """Whether a Newton decrement counts as converged."""
         return decrement <= max(self.tolerance**2, _ROUNDING * abs(self.errors[-1]))
 
+    def judge(self, view: NonlinearView, values: Any) -> bool:
+        """Whether the run is over: converged, or without a decrease any more; says so."""
+        stalled = len(self.errors) > 1 and self.errors[-1] >= self.errors[-2]
+        left = _newton_decrement(view, values)
+        if self.small(left) or (stalled and left <= _STALLED * max(1.0, abs(self.errors[-1]))):
+            self.end(Status.SOLVED, f"converged in {self.iterations} iterations")
+            return True
+        if stalled:
+            self.stalls += 1
+        if self.stalls >= 5:
+            self.end(
+                Status.NOT_CONVERGED,
+                "stalled: no step decreases the objective although its gradient is not zero",
+            )
+            return True
+        return False
+
     def exhausted(self) -> bool:
         """Whether a limit ends the run; says so."""
         if self.iterations >= self.limit:
@@ -107,7 +134,7 @@ class _Run:
 
 
 def _name_of(view: NonlinearView, key: int) -> str:
-    import gtsam
+    gtsam = load_gtsam()
 
     if view.keys is not None and key in view.keys.name:
         return view.keys.name[key]
@@ -116,14 +143,14 @@ def _name_of(view: NonlinearView, key: int) -> str:
 
 def _decrement(linear: Any, delta: Any) -> float:
     """Decrease that a step promises on a linearised graph."""
-    import gtsam
+    gtsam = load_gtsam()
 
     return float(linear.error(gtsam.VectorValues.Zero(delta)) - linear.error(delta))
 
 
 def _newton_decrement(view: NonlinearView, values: Any) -> float:
     """Decrease that the full, undamped step promises at `values`."""
-    import gtsam
+    gtsam = load_gtsam()
 
     linear = view.graph.linearize(values)
     ordering = gtsam.Ordering.ColamdGaussianFactorGraph(linear)
@@ -138,7 +165,7 @@ class _Batch(GtsamNonlinear):
         """The optimiser at the view's values."""
 
     def _iterate(self, view: NonlinearView, run: _Run) -> Any:
-        import gtsam
+        gtsam = load_gtsam()
 
         optimizer = self._optimizer(view)
         # The wrapper hands out a reference into the optimiser, which the next iteration frees: always copy.
@@ -154,13 +181,9 @@ class _Batch(GtsamNonlinear):
             if not np.isfinite(run.errors[-1]):
                 run.end(Status.NUMERICAL_ERROR, "the objective is not finite")
                 break
-            if not run.small(promised):
-                continue
-            if run.small(_newton_decrement(view, values)):
-                run.end(Status.SOLVED, f"converged in {run.iterations} iterations")
-                break
-            if run.errors[-1] >= run.errors[-2]:
-                run.end(Status.NOT_CONVERGED, "stalled: no step decreases the objective although its gradient is not zero")
+            # The full check costs an elimination: only when the step was small or did not go down.
+            worth_it = run.small(promised) or run.errors[-1] >= run.errors[-2]
+            if worth_it and run.judge(view, values):
                 break
         return values
 
@@ -171,7 +194,7 @@ class GtsamGaussNewton(_Batch):
     name: ClassVar[str] = "gtsam-gauss-newton"
 
     def _optimizer(self, view: NonlinearView) -> Any:
-        import gtsam
+        gtsam = load_gtsam()
 
         params = gtsam.GaussNewtonParams()
         params.setLinearSolverType("MULTIFRONTAL_QR")
@@ -184,7 +207,7 @@ class GtsamLevenbergMarquardt(_Batch):
     name: ClassVar[str] = "gtsam-levenberg-marquardt"
 
     def _optimizer(self, view: NonlinearView) -> Any:
-        import gtsam
+        gtsam = load_gtsam()
 
         params = gtsam.LevenbergMarquardtParams()
         params.setLinearSolverType("MULTIFRONTAL_QR")
@@ -201,11 +224,13 @@ class GtsamIsam2(GtsamNonlinear):
     name: ClassVar[str] = "gtsam-isam2"
 
     def _iterate(self, view: NonlinearView, run: _Run) -> Any:
-        import gtsam
+        gtsam = load_gtsam()
 
         params = gtsam.ISAM2Params()
         params.setFactorization("QR")
         params.relinearizeSkip = 1
+        # Its default does not pass on changes below 1e-3, which ends far from the optimum.
+        params.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(0.0))
         params.setRelinearizeThreshold(min(self.options.tolerance, 1e-6))
         isam = gtsam.ISAM2(params)
         run.record(view.values, view.graph.error(view.values))
@@ -222,14 +247,16 @@ class GtsamIsam2(GtsamNonlinear):
             if not np.isfinite(run.errors[-1]):
                 run.end(Status.NUMERICAL_ERROR, "the objective is not finite")
                 break
-            if run.small(_newton_decrement(view, values)):
-                run.end(Status.SOLVED, f"converged in {run.iterations} updates")
+            if run.judge(view, values):
                 break
         return values
 
 
 def increments(view: NonlinearView, parts: int) -> list[tuple[Any, Any]]:
-    """The graph of a view cut into consecutive parts, each of which leaves all variables so far determined.
+    """The graph of a view cut into parts, each of which leaves all variables so far determined.
+
+    A part brings some variables, in their order, with every factor that needs none of the later ones: a prior comes with its variable, so
+    that no part is solved with less information on its variables than it has to be.
 
     Parameters
     ----------
@@ -242,43 +269,32 @@ def increments(view: NonlinearView, parts: int) -> list[tuple[Any, Any]]:
     list of (gtsam.NonlinearFactorGraph, gtsam.Values)
         New factors and the values of the new variables.
     """
-    import gtsam
-
-    count = view.graph.size()
-    order = _natural_order(view)
-    edges = np.unique(np.linspace(0, count, max(parts, 1) + 1).astype(int))[1:]
+    gtsam = load_gtsam()
+    keys = list(view.keys.key.values() if view.keys is not None else view.values.keys())
+    rank = {key: i for i, key in enumerate(keys)}
+    factors = [view.graph.at(i) for i in range(view.graph.size())]
+    last = [max(map(rank.__getitem__, factor.keys()), default=0) for factor in factors]
     whole, fresh = gtsam.NonlinearFactorGraph(), gtsam.NonlinearFactorGraph()
-    known: set[int] = set()
-    new: set[int] = set()
     out: list[tuple[Any, Any]] = []
-    done = 0
-    for edge in edges:
-        for index in order[done:edge]:
-            factor = view.graph.at(index)
-            whole.push_back(factor)
-            fresh.push_back(factor)
-            new.update(key for key in factor.keys() if key not in known)
-        done = edge
-        if edge == count or _determined(whole, view.values):
-            out.append((fresh, _subset(view.values, new)))
+    begun = reached = 0
+    for edge in np.unique(np.linspace(0, len(keys), max(parts, 1) + 1).astype(int))[1:]:
+        for factor, needed in zip(factors, last, strict=True):
+            if reached <= needed < edge:
+                whole.push_back(factor)
+                fresh.push_back(factor)
+        reached = int(edge)
+        if reached == len(keys) or _determined(whole, view.values, reached):
+            out.append((fresh, _subset(view.values, set(keys[begun:reached]))))
             fresh = gtsam.NonlinearFactorGraph()
-            known |= new
-            new = set()
+            begun = reached
     return out
 
 
-def _natural_order(view: NonlinearView) -> list[int]:
-    """Factors sorted by the last variable that they need, so that no variable comes before its neighbours."""
-    keys = view.keys.key.values() if view.keys is not None else view.values.keys()
-    rank = {key: i for i, key in enumerate(keys)}
-    last = [max((rank[key] for key in view.graph.at(i).keys()), default=0) for i in range(view.graph.size())]
-    return [int(i) for i in np.argsort(last, kind="stable")]
-
-
-def _determined(graph: Any, values: Any) -> bool:
-    """Whether the factors so far determine their variables."""
-    import gtsam
-
+def _determined(graph: Any, values: Any, count: int) -> bool:
+    """Whether the factors so far determine the `count` variables so far."""
+    gtsam = load_gtsam()
+    if graph.size() == 0 or graph.keys().size() < count:
+        return False
     linear = graph.linearize(values)
     try:
         linear.optimize(gtsam.Ordering.ColamdGaussianFactorGraph(linear))
@@ -291,10 +307,10 @@ def _determined(graph: Any, values: Any) -> bool:
 
 def _subset(values: Any, keys: set[int]) -> Any:
     """The values of some keys, of whatever types they are."""
-    import gtsam
+    gtsam = load_gtsam()
 
     out = gtsam.Values(values)
-    for key in values.keys():
+    for key in list(values.keys()):
         if key not in keys:
             out.erase(key)
     return out

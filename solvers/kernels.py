@@ -20,9 +20,29 @@ class Kernels(NamedTuple):
     ldl_solve: Callable[..., None]
 
 
+WORTH_SECONDS = 0.5
+"""What importing numba and reading its cache takes: compiled loops come in when numpy has spent as much on the same work."""
+
+_spent = 0.0
+
+
+def load(seconds: float = float("inf")) -> Kernels | None:
+    """The compiled functions, when they are there and have become worth their loading.
+
+    Parameters
+    ----------
+    seconds : float
+        What the call at hand takes without them; infinite insists on them.
+    """
+    global _spent
+    _spent += seconds
+    if _spent < WORTH_SECONDS:
+        return None
+    return _compile()
+
+
 @cache
-def load() -> Kernels | None:
-    """Compile (or read from numba's cache) on first use; None without numba."""
+def _compile() -> Kernels | None:
     if find_spec("numba") is None:
         return None
     import numba

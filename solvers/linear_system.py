@@ -107,8 +107,22 @@ class LinearSystem:
             failed = self._main.stalled
         except ArithmeticError:
             failed = True
-        if not failed:
-            return
+        if failed:
+            self._use_singular_values(values)
+
+    def for_covariance(self, values: LinearValues) -> System:
+        """The system of the last update, of which `values` were the values, in a form that has digits for the covariance.
+
+        Raises
+        ------
+        NotSolvedError
+            As `update`.
+        """
+        if self.system.imprecise:
+            self._use_singular_values(values)
+        return self.system
+
+    def _use_singular_values(self, values: LinearValues) -> None:
         if self.size > DENSE_RESCUE_UP_TO:
             raise NotSolvedError(
                 "the covariances span more orders of magnitude than double precision can carry for a problem of this size: "
@@ -116,8 +130,8 @@ class LinearSystem:
             )
         if self._rescue is None:
             self._rescue = self._dense()
-        self.system = self._rescue
         _fill(self._rescue, values)
+        self.system = self._rescue
 
     @property
     def stamp(self) -> int:

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from factorgrasp.solvers.base import Solution
+from factorgrasp.status import Status
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,9 @@ Solve = Callable[[Solution | None], Solution]
 """Solves one problem, from a start or from nothing."""
 
 
-def measure(fresh: Callable[[], Solve], repeat: int, budget: float = 1.0) -> tuple[Solution, Timing, Solution]:
+def measure(
+    fresh: Callable[[], Solve], repeat: int, budget: float = 1.0
+) -> tuple[Solution, Timing, Solution]:
     """Solve one problem cold and warm, several times.
 
     Parameters
@@ -75,7 +78,7 @@ def measure(fresh: Callable[[], Solve], repeat: int, budget: float = 1.0) -> tup
         setup_times.append(answer.setup_time)
         cold_times.append(answer.solve_time)
         start = time.perf_counter()
-        last = run(answer if np.all(np.isfinite(answer.x)) else None)
+        last = run(answer if answer.status is Status.SOLVED else None)
         warm_times.append(time.perf_counter() - start)
         done += 1
     timing = Timing(

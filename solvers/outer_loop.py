@@ -23,6 +23,8 @@ ROUNDING = 1e-15
 """Share of the objective below which its changes are noise."""
 GOOD_ENOUGH = 1e-4
 """Step in standard deviations below which an iteration that cannot improve any more counts as converged."""
+NO_DAMPING = 1e-8
+"""Damping below which the length of a step says how far the optimum is; a strongly damped step is always short."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +49,7 @@ class LoopOptions:
     max_iterations: int = 100
     step_tolerance: float = 1e-8
     damping: float = 0.0
-    max_refinements: int = 8
+    max_refinements: int = 20
     max_escapes: int = 3
 
 
@@ -248,7 +250,7 @@ def smallest_step(options: LoopOptions, objective: float) -> float:
 
 def cannot_improve(log: list[Iteration]) -> bool:
     """Whether the last steps are tiny and no longer shrink: what is left is the noise of the linear solver."""
-    recent = [line.step for line in log[-4:]]
+    recent = [line.step for line in log[-4:] if line.damping <= NO_DAMPING]
     return len(recent) == 4 and max(recent) <= GOOD_ENOUGH and min(recent[1:]) > 0.9 * recent[0]
 
 

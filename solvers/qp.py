@@ -16,7 +16,14 @@ from factorgrasp.least_squares import LeastSquares, QuadraticProgram
 from factorgrasp.solvers.base import Capabilities, Solution, Solver, SolverOptions
 from factorgrasp.solvers.qp_cached import CACHED
 from factorgrasp.solvers.qp_form import QpForm, make_form
-from factorgrasp.solvers.qp_oneshot import DENSE, FOLD_BOUNDS, NEEDS_ROWS, ONE_SHOT, RawResult, solve_with_qpsolvers
+from factorgrasp.solvers.qp_oneshot import (
+    DENSE,
+    FOLD_BOUNDS,
+    NEEDS_ROWS,
+    ONE_SHOT,
+    RawResult,
+    solve_with_qpsolvers,
+)
 from factorgrasp.solvers.qp_options import backend_settings, ignored_options
 from factorgrasp.solvers.qp_status import read_status, status_words
 from factorgrasp.status import Status
@@ -30,7 +37,10 @@ MODULES: dict[str, tuple[str, str]] = {
     "ecos": ("ecos", "ecos"),
     "gurobi": ("gurobipy", "gurobipy"),
     "highs": ("highspy", "highspy"),
-    "hpipm": ("hpipm_python", "git+https://github.com/giaf/hpipm#subdirectory=interfaces/python/hpipm_python"),
+    "hpipm": (
+        "hpipm_python",
+        "git+https://github.com/giaf/hpipm#subdirectory=interfaces/python/hpipm_python",
+    ),
     "jaxopt_osqp": ("jaxopt", "jaxopt"),
     "kvxopt": ("kvxopt", "kvxopt"),
     "mosek": ("mosek", "cvxopt mosek"),
@@ -54,6 +64,11 @@ MODULES: dict[str, tuple[str, str]] = {
 WARM_STARTED = frozenset({"daqp", "osqp", "proxqp"})
 """Backends that gain from a start as they are reached here. Interior-point methods do not; the starts of qpalm and scs do not get through
 qpsolvers 4.13 (no iteration saved: measured)."""
+
+
+_GROSS = 1e-3
+"""Violation of a constraint, relative to the numbers in its row, from which a claim to have solved is not believed. Whether it is within
+the tolerance is the certificate's business; this is for answers that have nothing to do with the question."""
 
 
 class QpSession:
@@ -84,9 +99,12 @@ class QpSession:
         start_time = time.perf_counter()
         try:
             form = make_form(qp, self.backend in FOLD_BOUNDS, self.backend in NEEDS_ROWS)
-            warm_start = warm_start if self.backend in WARM_STARTED else None
+            if self.backend not in WARM_STARTED or not _usable(warm_start, qp.q.size):
+                warm_start = None
             if self._cached is None:
-                raw = ONE_SHOT.get(self.backend, solve_with_qpsolvers)(self.backend, form, self._settings, warm_start)
+                raw = ONE_SHOT.get(self.backend, solve_with_qpsolvers)(
+                    self.backend, form, self._settings, warm_start
+                )
             else:
                 self._cached.load(form)
                 raw = self._cached.run(form, warm_start)
@@ -101,8 +119,12 @@ class QpSession:
         message = "; ".join(
             part for part in (status_words(self.backend, raw.raw), raw.message, self._ignored()) if part
         )
-        if status is Status.SOLVED and not np.all(np.isfinite(x)):
-            status, message = Status.NUMERICAL_ERROR, message + "; but its answer is not finite"
+        if status is Status.SOLVED:
+            if not np.all(np.isfinite(x)):
+                status, message = Status.NUMERICAL_ERROR, message + "; but its answer is not finite"
+            elif (violation := _violation(form, x)) > max(_GROSS, 100.0 * self.options.tolerance):
+                status = Status.NOT_CONVERGED
+                message += f"; but its answer violates a constraint by {violation:.2g} of the numbers in it"
         z, z_box = _multipliers(raw, form)
         elapsed = time.perf_counter() - start_time
         return Solution(
@@ -145,10 +167,18 @@ class QpSolver(Solver):
     name: ClassVar[str] = "qp"
 
     def setup(self, problem: LeastSquares) -> None:
-        """Remember the problem and the entries that its Hessian can have."""
-        self._problem = problem
-        self._session = QpSession(self.name, self.options)
+        """Remember the problem and the entries that its Hessian can have; what the backend keeps survives for the same pattern."""
         pattern = problem.jacobian.matrix
+        known: LeastSquares | None = getattr(self, "_problem", None)
+        self._problem = problem
+        if known is not None:
+            old = known.jacobian.matrix
+            if old.shape == pattern.shape and all(
+                np.array_equal(a, b)
+                for a, b in ((old.indptr, pattern.indptr), (old.indices, pattern.indices))
+            ):
+                return
+        self._session = QpSession(self.name, self.options)
         ones = sp.csr_array((np.ones(pattern.nnz), pattern.indices, pattern.indptr), shape=pattern.shape)
         self._session.expect(ones.T @ ones)
 
@@ -180,7 +210,10 @@ def solver_class(name: str) -> type[Solver]:
 
 
 def solve_qp(
-    qp: QuadraticProgram, backend: str, options: SolverOptions | None = None, warm_start: Solution | None = None
+    qp: QuadraticProgram,
+    backend: str,
+    options: SolverOptions | None = None,
+    warm_start: Solution | None = None,
 ) -> Solution:
     """Solve one quadratic program with one backend, from scratch.
 
@@ -205,8 +238,33 @@ def solve_qp(
         When the backend is unknown or not installed.
     """
     if backend in MODULES and not solver_class(backend).installed():
-        raise SolverError(f"QP backend {backend!r} is not installed: pip install qpsolvers {MODULES[backend][1]}")
+        raise SolverError(
+            f"QP backend {backend!r} is not installed: pip install qpsolvers {MODULES[backend][1]}"
+        )
     return QpSession(backend, options).solve(qp, warm_start)
+
+
+def _usable(start: Solution | None, size: int) -> bool:
+    """Whether a start is finite throughout; a single infinite multiplier keeps ProxQP busy for minutes."""
+    return (
+        start is not None
+        and start.x.size == size
+        and all(bool(np.all(np.isfinite(part))) for part in (start.x, start.y, start.z, start.z_box))
+    )
+
+
+def _violation(form: QpForm, x: FloatArray) -> float:
+    """Largest violation of a constraint, relative to the sizes of the numbers in its row and at least one."""
+    worst = 0.0
+    for rows, side, two_sided in ((form.G, form.h, False), (form.A, form.b, True)):
+        if rows is not None and side is not None:
+            error = rows @ x - side
+            size = 1.0 + np.abs(side) + abs(rows) @ np.abs(x)
+            worst = max(worst, float(np.max((np.abs(error) if two_sided else error) / size)))
+    for bound, sign in ((form.lb, -1.0), (form.ub, 1.0)):
+        if bound is not None and bound.size:
+            worst = max(worst, float(np.max(sign * (x - bound) / (1.0 + np.abs(x)))))
+    return worst
 
 
 def _vector(value: FloatArray | None, size: int, missing: float) -> FloatArray:

@@ -6,6 +6,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import replace
+from importlib import import_module
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -43,9 +44,10 @@ class Pattern(NamedTuple):
         for mine, theirs in ((self.P, other.P), (self.G, other.G), (self.A, other.A)):
             if (mine is None) != (theirs is None):
                 return False
-            if mine is not None and theirs is not None:
-                if not all(np.array_equal(a, b) for a, b in zip(mine, theirs, strict=True)):
-                    return False
+            if mine is None or theirs is None:
+                continue
+            if not all(np.array_equal(a, b) for a, b in zip(mine, theirs, strict=True)):
+                return False
         return np.array_equal(self.lower, other.lower) and np.array_equal(self.upper, other.upper)
 
 
@@ -136,7 +138,8 @@ class _Stack:
         """The stack for the values of a form."""
         source = self._matrix
         return sp.csc_matrix(
-            (self.data(form), source.indices.astype(np.int32), source.indptr.astype(np.int32)), shape=source.shape
+            (self.data(form), source.indices.astype(np.int32), source.indptr.astype(np.int32)),
+            shape=source.shape,
         )
 
 
@@ -160,7 +163,7 @@ class OsqpBackend(CachedBackend):
     """OSQP: the KKT pattern, the scaling and the step size stay; new values cost one refactorisation."""
 
     def build(self, form: QpForm) -> None:
-        import osqp
+        osqp: Any = import_module("osqp")
 
         self._bounds = form.lb is not None or form.ub is not None
         self._stack = _Stack(form, ("G", "A"), self._bounds)
@@ -185,9 +188,9 @@ class OsqpBackend(CachedBackend):
         self._solver.update(q=form.q, l=lower, u=upper, **matrices)
 
     def run(self, form: QpForm, start: Solution | None) -> RawResult:
-        import osqp
+        osqp: Any = import_module("osqp")
 
-        if start is not None and np.all(np.isfinite(start.x)):
+        if start is not None:
             y, z, box = form.forward(start)
             self._solver.warm_start(x=start.x, y=np.concatenate([z, y, box] if self._bounds else [z, y]))
         else:
@@ -202,7 +205,11 @@ class OsqpBackend(CachedBackend):
         # At a certificate of infeasibility OSQP fills its iterate with a placeholder.
         usable = "INFEASIBLE" not in raw and found.x is not None and found.x[0] is not None
         x = np.asarray(found.x, dtype=float) if usable else None
-        dual = np.asarray(found.y, dtype=float) if usable else np.zeros(m + k + (form.size if self._bounds else 0))
+        dual = (
+            np.asarray(found.y, dtype=float)
+            if usable
+            else np.zeros(m + k + (form.size if self._bounds else 0))
+        )
         return RawResult(
             raw, None, x, dual[m : m + k], dual[:m], dual[m + k :], int(found.info.iter), elapsed
         )
@@ -223,7 +230,7 @@ class PiqpBackend(CachedBackend):
     """PIQP: the ordering and the symbolic factorisation stay."""
 
     def build(self, form: QpForm) -> None:
-        import piqp
+        piqp: Any = import_module("piqp")
 
         settings = dict(self.settings)
         dense = settings.pop("backend", "sparse") == "dense"
@@ -280,7 +287,7 @@ class ClarabelBackend(CachedBackend):
     fold_bounds = True
 
     def build(self, form: QpForm) -> None:
-        import clarabel
+        clarabel: Any = import_module("clarabel")
 
         settings = clarabel.DefaultSettings()
         settings.verbose = False
@@ -311,7 +318,14 @@ class ClarabelBackend(CachedBackend):
         k = 0 if form.b is None else form.b.size
         dual = np.array(found.z, dtype=float)
         return RawResult(
-            str(found.status), None, np.array(found.x), dual[:k], dual[k:], np.empty(0), int(found.iterations), elapsed
+            str(found.status),
+            None,
+            np.array(found.x),
+            dual[:k],
+            dual[k:],
+            np.empty(0),
+            int(found.iterations),
+            elapsed,
         )
 
     @staticmethod
@@ -319,5 +333,9 @@ class ClarabelBackend(CachedBackend):
         return np.concatenate([side for side in (form.b, form.h, np.empty(0)) if side is not None])
 
 
-CACHED: Mapping[str, type[CachedBackend]] = {"clarabel": ClarabelBackend, "osqp": OsqpBackend, "piqp": PiqpBackend}
+CACHED: Mapping[str, type[CachedBackend]] = {
+    "clarabel": ClarabelBackend,
+    "osqp": OsqpBackend,
+    "piqp": PiqpBackend,
+}
 """Backends with a set-up that outlives a solve."""

@@ -67,7 +67,9 @@ class QpForm:
         z = start.z if start.z.size == self.inequalities else np.zeros(self.inequalities)
         box = start.z_box if start.z_box.size == self.size else np.zeros(self.size)
         height = 0 if self.h is None else self.h.size
-        parts = np.concatenate([z[self.kept], np.maximum(box[self.upper], 0.0), np.maximum(-box[self.lower], 0.0)])
+        parts = np.concatenate(
+            [z[self.kept], np.maximum(box[self.upper], 0.0), np.maximum(-box[self.lower], 0.0)]
+        )
         return y, np.pad(parts, (0, height - parts.size)), box
 
 
@@ -127,5 +129,7 @@ def _csc(matrix: sp.sparray | sp.spmatrix) -> sp.csc_matrix:
     out = sp.csc_matrix(matrix)
     out.sort_indices()
     if out.indices.dtype != np.int32:
-        out = sp.csc_matrix((out.data, out.indices.astype(np.int32), out.indptr.astype(np.int32)), shape=out.shape)
+        out = sp.csc_matrix(
+            (out.data, out.indices.astype(np.int32), out.indptr.astype(np.int32)), shape=out.shape
+        )
     return out

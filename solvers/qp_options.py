@@ -51,10 +51,16 @@ KEYWORDS: Mapping[str, Keywords] = {
     ),
     "osqp": Keywords(*_EPS, "max_iter", "time_limit", fixed={"check_dualgap": True}),
     "piqp": Keywords(
-        ("eps_abs", "eps_duality_gap_abs"), ("eps_rel", "eps_duality_gap_rel"), "max_iter", fixed={"check_duality_gap": True}
+        ("eps_abs", "eps_duality_gap_abs"),
+        ("eps_rel", "eps_duality_gap_rel"),
+        "max_iter",
+        fixed={"check_duality_gap": True},
     ),
     "proxqp": Keywords(
-        ("eps_abs", "eps_duality_gap_abs"), ("eps_rel", "eps_duality_gap_rel"), "max_iter", fixed={"check_duality_gap": True}
+        ("eps_abs", "eps_duality_gap_abs"),
+        ("eps_rel", "eps_duality_gap_rel"),
+        "max_iter",
+        fixed={"check_duality_gap": True},
     ),
     "qpalm": Keywords(*_EPS, "max_iter", "time_limit"),
     "quadprog": Keywords(),

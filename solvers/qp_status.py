@@ -182,7 +182,7 @@ def read_status(backend: str, raw: str, found: bool | None = None) -> Status:
     if found:
         return Status.SOLVED
     lower = raw.lower()
-    if "dual" in lower and "infeasible" in lower or "unbounded" in lower:
+    if ("dual" in lower and "infeasible" in lower) or "unbounded" in lower:
         return Status.UNBOUNDED
     if "infeasible" in lower:
         return Status.INFEASIBLE

@@ -68,7 +68,8 @@ def selected_inverse(
     lower = sp.csc_array(lower)
     lower.sort_indices()
     below, diagonal = np.zeros(lower.nnz), np.zeros(pivots.size)
-    fast = kernels.load() if compiled is not False else None
+    seconds = float("inf") if compiled else 6e-5 * pivots.size
+    fast = None if compiled is False else kernels.load(seconds)
     if fast is not None:
         indptr, rows = lower.indptr.astype(np.int64), lower.indices.astype(np.int64)
         fast.selected_inverse(indptr, rows, lower.data, np.ascontiguousarray(pivots), diagonal, below)

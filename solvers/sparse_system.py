@@ -2,7 +2,7 @@
 
 ``min || A x - b ||^2  s.t.  E x = e``  by  ``[[H, E'], [E, -d]] [x; y] = [A'b + E'R e; e]``  with ``H = A'A + E'R E``: adding the squared
 constraints changes neither x nor y, but makes H positive definite whenever the problem is observable at all. R scales every row of E to
-unit size in units of the unknowns' own conditional standard deviations, and ``d = 1e-12 R^-1`` keeps the matrix quasi-definite even where
+unit size in units of the unknowns' own conditional standard deviations, and ``d = 1e-7 R^-1`` keeps the matrix quasi-definite even where
 constraints repeat each other. Both are undone by iterative refinement, whose residuals go through A and E, not through H: this brings
 back the digits that squaring A costs.
 """
@@ -20,15 +20,21 @@ from factorgrasp.solvers.null_directions import NullSpace
 from factorgrasp.solvers.selected_inverse import SelectedInverse, selected_inverse
 from factorgrasp.typing import BoolArray, FloatArray, IntArray
 
-REGULARISATIONS = (1e-12, 1e-16)
-"""Of the constraint rows, relative to R: the second where the first makes refinement stall (weak priors under many constraints)."""
+REGULARISATIONS = (1e-7, 1e-16)
+"""Of the constraint rows, relative to R. The first balances what it leaves to refinement against what rounding does; the second comes in
+where refinement stalls because weak priors stand under many constraints."""
 WELL_CONDITIONED = 1e-6
 SUSPICIOUS = 1e-10
 """Estimated smallest eigenvalues of the scaled H above which the factor needs no refinement for covariances, and below which missing
 directions are looked for."""
+BEYOND_PRECISION = 1e-14
+"""The same (times the root of n, by which the estimate may be too large), below which normal equations in double precision say nothing
+about the variance of the weakest direction."""
+WEAK = 1e-5
+"""Singular value of the scaled A below which a direction is looked at twice."""
 MOST_REFINEMENTS = 10
-TRUSTED_SHARE = 1e-6
-"""Share of the conditional variance above which a variance of the selected inverse is right to six digits despite the regularisation."""
+ACCURATE = 1e-9
+"""Smallest eigenvalue of the scaled H above which the selected inverse is right to six digits."""
 ENERGY_TOLERANCE = 1e-9
 """Refinement ends when its next correction will be below this many posterior standard deviations."""
 
@@ -75,6 +81,7 @@ class SparseSystem:
     def update(self, entries: FloatArray, rhs: FloatArray, hard: sp.csr_array, hard_rhs: FloatArray) -> None:
         """New values: non-zeros of A, b, E (with the pattern given) and e; factors and solves."""
         self.stamp += 1
+        self.stalled = False
         self._inverse: SelectedInverse | None = None
         self._matrix = sp.csr_array((entries, *self._pattern), shape=(rhs.size, self.size))
         self._hard = hard
@@ -127,13 +134,14 @@ class SparseSystem:
         residual, gap = rhs, hard_rhs
         floor = max(ENERGY_TOLERANCE, 1e-14 * float(np.linalg.norm(rhs)))
         before, self.stalled = np.inf, False
+        root = np.sqrt(self._row_weight)
         for step in range(MOST_REFINEMENTS + 1):
             right = matrix.T @ residual
             if self.hard_rows:
                 right = np.concatenate([right - hard.T @ y + hard.T @ (self._row_weight * gap), gap])
             change = self._ldl.solve(right)
             moved = matrix @ change[:count]
-            energy = float(np.linalg.norm(moved))
+            energy = float(np.hypot(np.linalg.norm(moved), np.linalg.norm(root * (hard @ change[:count]))))
             if step > 1 and energy > 0.5 * before:
                 # At rounding level already, or refinement cannot gain on the error of the factor.
                 self.stalled = before > 1e-6 and before > 1e-10 * float(np.linalg.norm(rhs))
@@ -158,19 +166,28 @@ class SparseSystem:
 
     # ---- covariance -------------------------------------------------------------------------------------------
 
+    @property
+    def imprecise(self) -> bool:
+        """Whether the factor has no digits left for the variance of the weakest direction; the solution may be right all the same."""
+        return bool(self._weakest < BEYOND_PRECISION * np.sqrt(self.size))
+
     def apply(self, columns: FloatArray) -> FloatArray:
         """``P B`` for B (n,) or (n, k), refined through A and E where the factor alone is not to be trusted."""
         count, weight = self.size, self._row_weight
         if columns.ndim == 2:
             weight = weight[:, None]
         whole = self._ldl.solve(np.concatenate([columns, np.zeros((self.hard_rows, *columns.shape[1:]))]))
+        before = np.inf
         for _ in range(MOST_REFINEMENTS if self.hard_rows or self._weakest < WELL_CONDITIONED else 0):
             x, y = whole[:count], whole[count:]
             first = columns - self._matrix.T @ (self._matrix @ x) - self._hard.T @ y
             second = -(self._hard @ x)
             change = self._ldl.solve(np.concatenate([first + self._hard.T @ (weight * second), second]))
-            whole = whole + change
-            if np.abs(change[:count]).max(initial=0.0) <= 1e-8 * np.abs(x).max(initial=0.0):
+            moved = float(np.linalg.norm(change[:count].T / self._scale))
+            if moved > 0.5 * before:
+                break
+            whole, before = whole + change, moved
+            if moved <= 1e-13 * float(np.linalg.norm(x.T / self._scale)):
                 break
         return self.null.project_out(whole[:count])
 
@@ -184,28 +201,29 @@ class SparseSystem:
         return self._inverse
 
     def variances(self) -> FloatArray:
-        """Diagonal of P (n,) by the selected inverse; right where no null direction reaches."""
-        inverse = self.selected()
-        out = inverse.diagonal[self._place[: self.size]].copy()
-        if self.hard_rows:
-            # The regularisation of E adds about 1e-12 conditional variances: too much for what the constraints fix almost exactly.
-            doubtful = np.flatnonzero(out < TRUSTED_SHARE * self._scale**2)
-            for part in np.array_split(doubtful, doubtful.size // 256 + 1):
-                columns = np.zeros((self.size, part.size))
-                columns[part, np.arange(part.size)] = 1.0
-                out[part] = self.apply(columns)[part, np.arange(part.size)]
+        """Diagonal of P (n,); right where no null direction reaches.
+
+        By the selected inverse; column by column with refinement where that has too few digits: under constraints, whose regularisation
+        it would show, and in ill-conditioned systems.
+        """
+        if self._selectable:
+            return np.maximum(self.selected().diagonal[self._place], 0.0)
+        out = np.empty(self.size)
+        for part in np.array_split(np.arange(self.size), self.size // 256 + 1):
+            columns = np.zeros((self.size, part.size))
+            columns[part, np.arange(part.size)] = 1.0
+            out[part] = self.apply(columns)[part, np.arange(part.size)]
         return np.maximum(out, 0.0)
 
     def block(self, indices: IntArray) -> FloatArray | None:
-        """Block of P at `indices` when the selected inverse holds it."""
-        if self.null.count or self._inverse is None:
+        """Block of P at `indices` when the selected inverse is there and holds it."""
+        if self._inverse is None or self.null.count or not self._selectable:
             return None
-        out = self._inverse.block(self._place[indices])
-        if out is None or (
-            self.hard_rows and np.any(np.diag(out) < TRUSTED_SHARE * self._scale[indices] ** 2)
-        ):
-            return None
-        return out
+        return self._inverse.block(self._place[indices])
+
+    @property
+    def _selectable(self) -> bool:
+        return self.hard_rows == 0 and self._weakest >= ACCURATE
 
     # ---- directions without information -----------------------------------------------------------------------
 
@@ -222,43 +240,70 @@ class SparseSystem:
             shifted[self._gram.diagonal] *= 1.0 + 1e-12
             if not self._ldl.factorize(shifted):
                 raise ArithmeticError("the normal equations cannot be factored")
-        axes = self._search_null()
-        if axes.shape[1] == 0 and healthy:
-            return
-        values = self._values.copy()
-        if axes.shape[1]:
-            _, _, order = qr(axes.T, pivoting=True, mode="economic")
-            pins = self._gram.diagonal[order[: axes.shape[1]]]
-            values[pins] *= 2.0
-        elif not healthy:
-            values[self._gram.diagonal] *= 1.0 + 1e-12
-        self.null = NullSpace(axes, self._scale)
-        self._ldl.factorize(values)
+        axes = self._candidates()
+        while axes.shape[1]:
+            self._pin(axes)
+            axes = self._polish(axes)
+            missing = self._seen(axes) < NULL_TOLERANCE
+            if missing.all():
+                self.null = NullSpace(axes, self._scale)
+                break
+            axes = axes[:, missing]
+        else:
+            if not self._ldl.factorize(self._values):
+                raise ArithmeticError("the normal equations have no digits left for the weakest direction")
+        self._weakest = self._smallest_eigenvalue()
 
-    def _search_null(self) -> FloatArray:
-        """Orthonormal null directions (n, k) in scaled coordinates, by block inverse iteration judged through A and E."""
+    def _seen(self, axes: FloatArray) -> FloatArray:
+        """How much A and E see of orthonormal scaled directions; they are turned so that each stands for one singular value."""
+        image = axes * self._scale[:, None]
+        seen = np.vstack([self._matrix @ image, (self._hard @ image) * np.sqrt(self._row_weight)[:, None]])
+        _, values, right = np.linalg.svd(np.linalg.qr(seen, mode="r"), full_matrices=True)
+        out = np.zeros(axes.shape[1])
+        out[: values.size] = values
+        axes[:] = axes @ right.T
+        return out
+
+    def _candidates(self) -> FloatArray:
+        """Orthonormal scaled directions (n, k) of which A and E see little, by block inverse iteration."""
         rng = np.random.default_rng(0)
         known = np.flatnonzero(~self._empty)
-        structural = np.eye(self.size)[:, self._empty] if self._empty.any() else np.empty((self.size, 0))
+        empty = np.eye(self.size)[:, self._empty] if self._empty.any() else np.empty((self.size, 0))
         width = 4
         while True:
             width = min(width, known.size)
             block = np.zeros((self.size, width))
             block[known] = rng.standard_normal((known.size, width))
-            for _ in range(4):
+            for _ in range(3):
                 image = self._corner(block / self._scale[:, None]) / self._scale[:, None]
                 image[self._empty] = 0.0
                 block = np.linalg.qr(image)[0]
-            seen = sp.vstack([self._matrix, self._hard * np.sqrt(self._row_weight)[:, None]]) @ (
-                block * self._scale[:, None]
-            )
-            _, values, right = np.linalg.svd(np.linalg.qr(seen, mode="r"), full_matrices=True)
-            padded = np.zeros(width)
-            padded[: values.size] = values
-            missing = padded < NULL_TOLERANCE
-            if not missing.all() or width == known.size:
-                return np.hstack([structural, block @ right.T[:, missing]])
+            weak = self._seen(block) < WEAK
+            if not weak.all() or width == known.size:
+                return np.hstack([empty, block[:, weak]])
             width *= 2
+
+    def _pin(self, axes: FloatArray) -> None:
+        """Factor with as many unknowns held as there are directions: those that tell the directions apart best."""
+        _, _, order = qr(axes.T, pivoting=True, mode="economic")
+        values = self._values.copy()
+        values[self._gram.diagonal[order[: axes.shape[1]]]] *= 2.0
+        if not self._ldl.factorize(values):
+            raise ArithmeticError("the pinned normal equations cannot be factored")
+
+    def _polish(self, axes: FloatArray) -> FloatArray:
+        """Remove what A and E still see of nearly null directions, with residuals through A: a null direction ends at rounding."""
+        scale, weight = self._scale[:, None], self._row_weight[:, None]
+        for _ in range(3):
+            image = axes * scale
+            gradient = self._matrix.T @ (self._matrix @ image) + self._hard.T @ (
+                weight * (self._hard @ image)
+            )
+            # The constraints keep their multiplier at zero here: what they see of a direction is to vanish, not to be balanced.
+            gap = self._hard @ image
+            image = image - self._ldl.solve(np.concatenate([gradient, gap]))[: self.size]
+            axes = np.linalg.qr(image / scale)[0]
+        return axes
 
 
 def _row_weights(hard: sp.csr_array, information: FloatArray) -> FloatArray:

@@ -7,7 +7,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 import pytest
+
+from factorgrasp import lie
+from factorgrasp.recordings import ImuStream, PoseStream
 
 SEED = 20240229
 
@@ -45,3 +49,31 @@ def dataset(data_dir: Path) -> Callable[[str], Path]:
 def rng() -> np.random.Generator:
     """A generator that gives every test the same numbers, whatever ran before it."""
     return np.random.default_rng(SEED)
+
+
+@pytest.fixture(scope="session")
+def broad_trial(dataset: Callable[[str], Path]) -> Callable[..., tuple[PoseStream, ImuStream]]:
+    """Robot (optical body) and hand (IMU) streams of a `broad` trial.
+
+    The body of the pose stream is moved by a rigid transform, ``p' = p + R offset``, ``R' = R Exp(turn)``; `half` takes one half of the motion.
+    """
+
+    def load(
+        name: str, offset: npt.ArrayLike = (0, 0, 0), turn: npt.ArrayLike = (0, 0, 0), half: int | None = None
+    ) -> tuple[PoseStream, ImuStream]:
+        data = np.load(dataset(f"broad/{name}.npz"))
+        t = np.arange(data["opt_pos"].shape[0]) / float(data["fs"])
+        R = lie.quaternion_wxyz_to_matrix(data["opt_quat"])
+        position = data["opt_pos"] + R @ np.asarray(offset)
+        quaternion = lie.matrix_to_quaternion_wxyz(R @ lie.so3_exp(turn), continuous=True)
+        moving = np.asarray(data["movement"], dtype=bool)
+        position[~moving], quaternion[~moving] = np.nan, np.nan
+        robot = PoseStream(t, position, quaternion)
+        hand = ImuStream(t, data["imu_gyr"].astype(float), data["imu_acc"].astype(float))
+        if half is not None:
+            rows = np.flatnonzero(moving)
+            first, middle, last = t[rows[0]], t[rows[rows.size // 2]], t[rows[-1]]
+            robot = robot.slice(first, middle) if half == 0 else robot.slice(middle, last)
+        return robot, hand
+
+    return load

@@ -29,7 +29,7 @@ import numpy as np
 import numpy.typing as npt
 
 from factorgrasp.errors import InputError
-from factorgrasp.lie import quaternion_wxyz_to_matrix
+from factorgrasp.lie import project_to_so3, quaternion_wxyz_to_matrix, skew
 from factorgrasp.typing import FloatArray
 
 ROTATION_FORGETTING = 0.5
@@ -310,3 +310,28 @@ def estimate_cehajic2015(
         "diverged" if message else "completed",
         message,
     )
+
+
+def batch_cehajic2015(inputs: CehajicInputs) -> tuple[FloatArray, FloatArray]:
+    """Both stages over a whole recording at once: every sample weighs alike, and nothing is known at the start.
+
+    What :class:`CehajicRecursion` tends to without forgetting and with a weak start, except that the second stage here uses the
+    final rotation for all samples.
+
+    Parameters
+    ----------
+    inputs : CehajicInputs
+        The signals of both sides on one clock.
+
+    Returns
+    -------
+    rotation : ndarray, shape (3, 3)
+        ``R_r_h``, Wahba's solution for the angular velocities.
+    translation : ndarray, shape (3,)
+        ``p_r_h`` (m), least squares on ``a_r - R a_h = -phi r``.
+    """
+    R = project_to_so3(inputs.robot_angular_velocity.T @ inputs.hand_angular_velocity)
+    w = skew(inputs.robot_angular_velocity)
+    psi = -(skew(inputs.robot_angular_acceleration) + w @ w).reshape(-1, 3)
+    left = (inputs.robot_acceleration - inputs.hand_acceleration @ R.T).reshape(-1)
+    return R, np.asarray(np.linalg.solve(psi.T @ psi, psi.T @ left))

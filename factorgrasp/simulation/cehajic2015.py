@@ -56,15 +56,23 @@ XSENS = HandImu(
 ENCODER_NOISE = RobotSensing(
     output="motion",
     rate=1000.0,
+    angular_velocity_sd=0.001,
+    angular_acceleration_sd=0.05,
+    acceleration_sd=0.02,
+)
+"""White noise of rates and accelerations that come from good encoders by differentiation, per sample at 1 kHz (not printed)."""
+
+ROUGH_ENCODER_NOISE = RobotSensing(
+    output="motion",
+    rate=1000.0,
     angular_velocity_sd=0.005,
     angular_acceleration_sd=0.5,
     acceleration_sd=0.2,
 )
-"""White noise of rates and accelerations that come from encoders by differentiation, per sample at 1 kHz (not printed).
+"""The same from coarse encoders: noise that spoils an estimator which takes the robot's signals as exact.
 
-Its angular acceleration matters most: it stands in the regressor, and ordinary least squares on it shortens the lever arm
-(errors in variables) by about ``2 sd^2 (G / T + 2 sd^2 I)^-1 r`` with the excitation matrix ``G`` over ``T``:
-127 mm on the exciting motion.
+The angular acceleration stands in the regressor, and ordinary least squares on it shortens the lever arm (errors in variables) by about
+``2 sd^2 (G / T + 2 sd^2 I)^-1 r`` with the excitation matrix ``G`` over ``T``: 200 mm on the exciting motion.
 """
 
 ENCODER_POSES = RobotSensing(output="pose", rate=1000.0, position_sd=5e-5, rotation_sd=5e-5)
@@ -85,13 +93,14 @@ def _printed_motion() -> RigidTrajectory:
 
 
 def _exciting_motion() -> RigidTrajectory:
-    # The rotation axis goes round a cone, and nods at a second frequency; the hand sways by a few millimetres.
-    u, v, n = np.array((0.0, 1.0, 0.0)), np.array((0.0, 0.0, 1.0)), np.array((1.0, 0.0, 0.0))
+    # A small fast cone shows the lever arm (angular accelerations about changing axes); slow wide turns about all axes show the
+    # rotation and tell gravity from the accelerometer's bias; the hand sways by a few millimetres.
+    x, y, z = np.eye(3)
     quarter = 0.5 * np.pi
-    amplitude = [0.14 * u, 0.14 * v, 0.05 * n + 0.03 * u]
-    phase = np.array([np.full(3, quarter), np.zeros(3), np.full(3, 0.4)])
+    amplitude = [0.10 * y, 0.10 * z, 0.05 * x + 0.03 * y, 0.70 * y, 0.56 * z, 0.42 * x]
+    phase = np.outer([quarter, 0.0, 0.4, 0.0, 1.0, 2.0], np.ones(3))
     return RigidTrajectory(
-        rotation=Sinusoids((0.0, 0.0, 0.0), amplitude, (0.6, 0.6, 0.95), phase),
+        rotation=Sinusoids((0.0, 0.0, 0.0), amplitude, (0.6, 0.6, 0.95, 0.08, 0.11, 0.133), phase),
         center=Sinusoids(_WRIST, [(0.004, 0.003, 0.002)], [0.23], [(0.0, 1.0, 2.0)]),
         lever=TRANSLATION,
     )
@@ -117,7 +126,7 @@ def cehajic2015(
         Of noise and biases.
     motion : {"exciting", "printed"}
         ``printed``: ``w_ref = [10 40 20] deg/s sin(t)`` about ``r_0`` (one axis: the lever arm along it cannot be seen).
-        ``exciting``: about the wrist, on a cone at 0.6 Hz with a second frequency of 0.95 Hz, at a similar peak rate (44 against 46 deg/s).
+        ``exciting``: about the wrist, slow wide turns about all axes with a small cone at 0.6 Hz, peak rate 67 deg/s (printed: 46).
     duration : float
         s (the paper: 60).
     robot, hand : RobotSensing, HandImu

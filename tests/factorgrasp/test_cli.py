@@ -251,6 +251,53 @@ def test_bad_arguments_are_2(exciting: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
+def test_warnings_are_lines_and_stand_in_the_report(exciting: Path, tmp_path: Path) -> None:
+    for path in exciting.parent.iterdir():
+        shutil.copy(path, tmp_path)
+
+    def shorten(values: np.ndarray) -> np.ndarray:
+        values[500] *= 0.98
+        return values
+
+    # As interpolation of quaternions across a change of sign leaves them: all four components shorter, in one row.
+    for column in ("qw", "qx", "qy", "qz"):
+        _edit(column, shorten)(tmp_path)
+    result = run("solve", tmp_path / "grasp.toml", "--out", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    (line,) = [line for line in result.stderr.splitlines() if line.startswith("warning: ")]
+    assert "robot.rotation_wxyz" in line
+    assert ".py" not in result.stderr
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert f'<p class="remark">{line.removeprefix("warning: ")}</p>' in page
+
+
+def test_compare_prints_and_writes(exciting: Path, tmp_path: Path) -> None:
+    result = run("compare", exciting, "--solvers", "cholesky,gtsam, osqp", "--out", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    assert "comparing solvers on" in result.stderr
+    record = json.loads((tmp_path / "out" / "comparison.json").read_text(encoding="utf-8"))
+    assert [row["solver"] for row in record["rows"]] == ["cholesky", "gtsam", "osqp"]
+    for row in record["rows"]:
+        assert row["status"] == "solved"
+        assert row["correct"]
+        # Ten millionths of a standard deviation: one answer, whoever computes it.
+        assert row["mean_difference"] < 1e-5
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        "comparison.json",
+        "comparison.csv",
+        "comparison.md",
+    }
+
+
+def test_compare_refuses_what_it_does_not_know(exciting: Path, tmp_path: Path) -> None:
+    for solvers in ("cholesky,nope", ","):
+        result = run("compare", exciting, "--solvers", solvers, "--out", tmp_path / "out")
+        assert result.exit_code == 2
+        assert result.stderr.splitlines()[-1].startswith("error: ")
+    assert run("compare", exciting, tmp_path / "none.toml").exit_code == 2
+    assert not (tmp_path / "out").exists()
+
+
 def test_solvers_lists_all(exciting: Path) -> None:
     result = run("solvers")
     assert result.exit_code == 0
@@ -281,7 +328,10 @@ def test_demo_compares_with_the_truth(tmp_path: Path) -> None:
     result = run("demo", "--out", tmp_path / "demo")
     assert result.exit_code == 0, result.output
     rows = {line[:22].strip(): line[22:].split() for line in result.stdout.splitlines()}
-    assert rows["position x"][:2] == ["1.110", "m"]
+    assert rows["position x"][:2] == ["mm", "1110.00"]
+    for name in ("position x", "rotation about z", "clock offset", "gyroscope bias y"):
+        error, claimed = map(float, rows[name][-2:])
+        assert abs(error) < 5.0 * claimed
     assert {path.name for path in (tmp_path / "demo").iterdir()} == {
         "robot.csv", "imu.csv", "truth.json", "grasp.toml", "estimate.json", "estimate.npz", "report.html",
     }  # fmt: skip

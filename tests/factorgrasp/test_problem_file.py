@@ -123,7 +123,7 @@ def test_joint_positions_through_a_urdf(recorded: Path, write: Callable[[str], P
     stated = 'kind = "grasp_pose"\n[robot]\nfile = "joints.csv"\nurdf = "arm.urdf"\n'
     with pytest.raises(InputError, match=r"\[robot\] frame: expected a string; found no such key"):
         load_problem(write(stated + HAND))
-    with pytest.raises(InputError, match="frame: expected one of .*l3.*; found 'tool'"):
+    with pytest.raises(InputError, match=r"frame: expected one of .*l3.*; found 'tool'"):
         load_problem(write(stated + 'frame = "tool"\n' + HAND))
     # The rates of this arm are not those of the recorded hand, but that is for the solver to find out.
     problem = build(

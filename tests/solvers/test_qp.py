@@ -48,11 +48,21 @@ def program(
     ub: np.ndarray | None = None,
 ) -> QuadraticProgram:
     return QuadraticProgram(
-        sp.csc_array(P), q, None if G is None else sp.csc_array(G), h, None if A is None else sp.csc_array(A), b, lb, ub, 0.0
+        sp.csc_array(P),
+        q,
+        None if G is None else sp.csc_array(G),
+        h,
+        None if A is None else sp.csc_array(A),
+        b,
+        lb,
+        ub,
+        0.0,
     )
 
 
-def random_program(seed: int, *, equalities: int = 0, inequalities: int = 0, bounds: bool = False) -> QuadraticProgram:
+def random_program(
+    seed: int, *, equalities: int = 0, inequalities: int = 0, bounds: bool = False
+) -> QuadraticProgram:
     rng = np.random.default_rng(seed)
     n = 4
     root = rng.normal(size=(6, n))
@@ -147,7 +157,9 @@ def test_optimum_and_multipliers(backend: str, parts: dict[str, int]) -> None:
         # ECOS may call 1e-9 reached with reduced accuracy only: an honest word, not a failure.
         assert found.status is Status.SOLVED or (backend == "ecos" and found.status is Status.NOT_CONVERGED)
         np.testing.assert_allclose(found.x, x, atol=accuracy)
-        assert 0.5 * found.x @ (qp.P @ found.x) + qp.q @ found.x == pytest.approx(objective, abs=10.0 * accuracy)
+        assert 0.5 * found.x @ (qp.P @ found.x) + qp.q @ found.x == pytest.approx(
+            objective, abs=10.0 * accuracy
+        )
         check_optimal(qp, found, 10.0 * accuracy)
         assert found.setup_time > 0.0
         assert found.solve_time > 0.0
@@ -168,9 +180,13 @@ def test_rows_and_bounds_at_infinity_are_no_constraints(backend: str) -> None:
 
 def test_infeasible_is_said(backend: str) -> None:
     first = np.eye(4)[:1]
-    inconsistent = random_program(0)._replace(G=sp.csc_array(np.vstack([first, -first])), h=np.array([-1.0, -1.0]))
+    inconsistent = random_program(0)._replace(
+        G=sp.csc_array(np.vstack([first, -first])), h=np.array([-1.0, -1.0])
+    )
     status = solve_qp(inconsistent, backend).status
-    if backend == "cvxopt":  # has no certificate of infeasibility: it breaks down, and may not call the problem solved
+    if (
+        backend == "cvxopt"
+    ):  # has no certificate of infeasibility: it breaks down, and may not call the problem solved
         assert status in (Status.NUMERICAL_ERROR, Status.NOT_CONVERGED)
     else:
         assert status is Status.INFEASIBLE
@@ -255,7 +271,8 @@ def chain(count: int = 6, size: int = 3) -> LeastSquares:
     variables = [Variable(f"x{i}", size) for i in range(count)]
     terms = [Term(f"prior{i}", size, (f"x{i}",), Covariance.scalar(4.0)) for i in range(count)]
     terms += [
-        Term(f"link{i}", size, (f"x{i}", f"x{i + 1}"), Covariance.diagonal(np.full(size, 0.01))) for i in range(count - 1)
+        Term(f"link{i}", size, (f"x{i}", f"x{i + 1}"), Covariance.diagonal(np.full(size, 0.01)))
+        for i in range(count - 1)
     ]
     constraints = [Constraint("tie", 1, ("x0", "x1")), Constraint("limit", 2, ("x2", "x4"), "inequality")]
     return LeastSquares(variables, terms, constraints)
@@ -265,7 +282,10 @@ def fill(problem: LeastSquares, seed: int, zeros: bool = False) -> None:
     rng = np.random.default_rng(seed)
     size = problem.variables[0].size
     for name, term in problem.terms.items():
-        blocks = {v: np.eye(size) if name.startswith("prior") else rng.normal(size=(size, size)) for v in term.variables}
+        blocks = {
+            v: np.eye(size) if name.startswith("prior") else rng.normal(size=(size, size))
+            for v in term.variables
+        }
         if zeros and name == "link2":  # entries of the Hessian vanish
             blocks = {v: np.diag(np.diag(block)) for v, block in blocks.items()}
         problem.set_term(name, blocks, rng.normal(size=term.rows))
@@ -340,7 +360,9 @@ def test_multipliers_go_there_and_back() -> None:
     form = make_form(qp._replace(h=np.array([qp.h[0], INFINITY, qp.h[2]])), fold_bounds=True)
     assert form.G is not None
     assert form.G.shape == (2 + 2 + 2, 4)
-    start = Solution(np.zeros(4), Status.SOLVED, z=np.array([1.0, 0.0, 3.0]), z_box=np.array([2.0, -4.0, 5.0, 0.0]))
+    start = Solution(
+        np.zeros(4), Status.SOLVED, z=np.array([1.0, 0.0, 3.0]), z_box=np.array([2.0, -4.0, 5.0, 0.0])
+    )
     _, z, box = form.forward(start)
     np.testing.assert_array_equal(z, [1.0, 3.0, 2.0, 5.0, 4.0, 0.0])
     back, back_box = form.back(z, np.zeros(4))
@@ -369,7 +391,9 @@ def test_status_map_knows_solved_and_maps_to_ours(name: str) -> None:
         ("highspy", "HighsModelStatus", "highs", "k"),
     ],
 )
-def test_status_map_covers_all_that_the_backend_can_say(module: str, enumeration: str, name: str, strip: str) -> None:
+def test_status_map_covers_all_that_the_backend_can_say(
+    module: str, enumeration: str, name: str, strip: str
+) -> None:
     package = pytest.importorskip(module)
     kind = attrgetter(enumeration)(package)
     words = {word.removeprefix(strip) for word in getattr(kind, "__members__", {})}

@@ -1,0 +1,181 @@
+"""One segment of a grasp recording as one cost on [rotation; translation; shared unknowns].
+
+The cost ``1/2 tr(L(x) Z L(x)')`` of a segment's moments Z (mathematics 2.3, 2.4) in three dresses: value, gradient and Gauss-Newton matrix;
+rows of a least-squares term; and gtsam factors. Taking the expected noise out can leave Z slightly indefinite where the segment excites
+nothing. That is kept as it is: with a clipped Z in every segment the segments would no longer add up to the recording. Value and
+gradient are always exact; rows, which cannot be indefinite, take the absolute value of the curvature, which changes the path of an
+iteration and not where it ends.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from factorgrasp.problems.grasp_model import GYRO_WIDTH, GraspModel, quadratic_forms
+from factorgrasp.typing import FloatArray, State
+
+# Curvature below this part of the largest (in scaled unknowns) is rounding.
+_ROUNDING = 1e-13
+
+
+@dataclass(frozen=True)
+class SegmentMoments:
+    """What one segment says.
+
+    Attributes
+    ----------
+    t : float
+        Mean centre of its windows, s, robot clock.
+    gyro, accelerometer : (10, 10) and (m, m) ndarray
+        Weighted sums over bands, less the expected noise.
+    gyro_score, accelerometer_score : (10, 10) and (m, m) ndarray
+        The same with squared window weights and with the noise in: the covariance of the scores.
+    numbers : float
+        Independent numbers in the residuals of both sensors.
+    """
+
+    t: float
+    gyro: FloatArray
+    accelerometer: FloatArray
+    gyro_score: FloatArray
+    accelerometer_score: FloatArray
+    numbers: float
+
+
+@dataclass(frozen=True)
+class Quadratic:
+    """``value + gradient' d + 1/2 d' matrix d`` of a step d (n,)."""
+
+    value: float
+    gradient: FloatArray
+    matrix: FloatArray
+
+    def rows(self) -> tuple[FloatArray, FloatArray]:
+        """``A`` (n + 1, n) and ``b`` (n + 1,) with ``A'A = |matrix|``, ``A'b = -gradient`` and ``1/2 |b|^2 = value``.
+
+        The last row of A is zero; its entry of b holds what no step can change.
+        """
+        size = self.gradient.size
+        diagonal = np.abs(np.diag(self.matrix))
+        scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+        values, vectors = np.linalg.eigh(self.matrix / np.outer(scale, scale))
+        curvature = np.abs(values)
+        used = curvature > _ROUNDING * curvature.max(initial=1e-300)
+        root = np.sqrt(np.where(used, curvature, 0.0))
+        A, b = np.zeros((size + 1, size)), np.zeros(size + 1)
+        A[:size] = root[:, None] * vectors.T * scale
+        b[:size] = -(vectors.T @ (self.gradient / scale)) / np.where(used, root, np.inf)
+        b[size] = np.sqrt(max(2.0 * self.value - float(b @ b), 0.0))
+        return A, b
+
+
+class SegmentFactor:
+    """The cost of one segment at any values of the unknowns.
+
+    Parameters
+    ----------
+    model : GraspModel
+    moments : SegmentMoments
+    slip_rate_variance : float
+        (rad/s)^2, of the mean angular velocity at which the hand turns against the end-effector within the segment. The gyroscope feels it
+        as a bias of this segment alone; it is eliminated. Zero for a hand that does not slip.
+    keys : tuple of int
+        gtsam keys of rotation, translation and the vector of shared unknowns (the last absent when there are none).
+    read : callable
+        From ``gtsam.Values`` to a state with the names of the grasp model.
+    """
+
+    def __init__(
+        self,
+        model: GraspModel,
+        moments: SegmentMoments,
+        slip_rate_variance: float,
+        keys: tuple[int, ...],
+        read: Callable[[Any], State],
+    ) -> None:
+        self.model, self.moments, self.keys = model, moments, keys
+        self._slip_rate_variance = slip_rate_variance
+        self._read = read
+
+    def quadratic(self, state: State) -> Quadratic:
+        """Second-order model of the cost at a state with the names of the grasp model."""
+        if self._slip_rate_variance > 0.0:
+            return self._slipping(state)[0]
+        moments, model = self.moments, self.model
+        (L_g, L_a), (J_g, J_a) = model.matrices(state), model.jacobians(state)
+        c_g, g_g, H_g = quadratic_forms(L_g, J_g, moments.gyro)
+        c_a, g_a, H_a = quadratic_forms(L_a, J_a, moments.accelerometer)
+        return Quadratic(c_g + c_a, g_g + g_a, H_g + H_a)
+
+    def score_covariance(self, state: State) -> FloatArray:
+        """Covariance (n, n) of the gradient, from the noise of measurement and from the slip."""
+        moments, model = self.moments, self.model
+        gain = None
+        if self._slip_rate_variance > 0.0:
+            _, state, gain = self._slipping(state)
+        (L_g, L_a), (J_g, J_a) = model.matrices(state), model.jacobians(state)
+        if gain is not None:
+            J_g = np.concatenate([J_g, _slip_jacobian(model, state)])
+        meat = quadratic_forms(L_g, J_g, moments.gyro_score)[2]
+        if gain is not None:
+            meat[-3:, -3:] += np.eye(3) / self._slip_rate_variance
+            lift = np.hstack([np.eye(model.size), -gain])
+            meat = lift @ meat @ lift.T
+        return np.asarray(meat + quadratic_forms(L_a, J_a, moments.accelerometer_score)[2])
+
+    def _slipping(self, state: State) -> tuple[Quadratic, State, FloatArray]:
+        """The cost at its best slip rate, the state with that rate in the gyroscope's bias, and ``H_xn H_nn^-1`` (n, 3)."""
+        moments, model = self.moments, self.model
+        precision = np.eye(3) / self._slip_rate_variance
+        L_g, _ = model.matrices(state)
+        # The rate enters the residual linearly: its best value follows from one solve.
+        _, gradient, matrix = quadratic_forms(L_g, _slip_jacobian(model, state), moments.gyro)
+        rate = -np.linalg.solve(matrix + precision, gradient)
+        state = {**state, "gyro_bias": model.value(state, "gyro_bias") + rate}
+        (L_g, L_a), (J_g, J_a) = model.matrices(state), model.jacobians(state)
+        J_g = np.concatenate([J_g, _slip_jacobian(model, state)])
+        c_g, g_g, H_g = quadratic_forms(L_g, J_g, moments.gyro)
+        c_a, g_a, H_a = quadratic_forms(L_a, J_a, moments.accelerometer)
+        n = model.size
+        gain = np.linalg.solve(H_g[n:, n:] + precision, H_g[n:, :n]).T
+        value = c_g + c_a + 0.5 * float(rate @ precision @ rate)
+        return Quadratic(value, g_g[:n] + g_a, H_g[:n, :n] - gain @ H_g[n:, :n] + H_a), state, gain
+
+    # ---- gtsam -----------------------------------------------------------------------------------------------
+
+    def hessian(self, values: Any) -> Any:
+        """``gtsam.HessianFactor`` at ``gtsam.Values``, curvature as it is: to be made again where the values have moved."""
+        import gtsam
+
+        form = self.quadratic(self._read(values))
+        parts = [slice(0, 3), slice(3, 6), slice(6, None)][: len(self.keys)]
+        arguments: list[Any] = list(self.keys)
+        for i, part in enumerate(parts):
+            arguments += [form.matrix[part, other] for other in parts[i:]]
+            arguments.append(-form.gradient[part])
+        return gtsam.HessianFactor(*arguments, 2.0 * form.value)
+
+    def custom(self) -> Any:
+        """``gtsam.CustomFactor`` that hands out the rows at any values: exact for any of gtsam's optimisers, a callback a linearisation."""
+        import gtsam
+
+        def error(_this: Any, values: Any, jacobians: Any) -> FloatArray:
+            A, b = self.quadratic(self._read(values)).rows()
+            if jacobians is not None:
+                jacobians[0], jacobians[1] = A[:, 0:3], A[:, 3:6]
+                if len(self.keys) == 3:
+                    jacobians[2] = A[:, 6:]
+            return -b
+
+        return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(self.model.size + 1), list(self.keys), error)
+
+
+def _slip_jacobian(model: GraspModel, state: State) -> FloatArray:
+    """(3, 3, 10): derivative of L_g by a rate that adds to the gyroscope's bias."""
+    out = np.zeros((3, 3, GYRO_WIDTH))
+    out[:, :, 9] = model.sensor_matrices(state)[0].T
+    return out

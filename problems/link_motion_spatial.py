@@ -1,0 +1,77 @@
+"""Spatial vectors ``[linear; angular]`` of links, batched over any leading axes (Featherstone 2008, with the linear part first)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from factorgrasp.typing import FloatArray
+
+
+def skew(v: FloatArray) -> FloatArray:
+    """``S(v)`` with ``S(v) u = v x u``; v (..., 3), out (..., 3, 3)."""
+    out = np.zeros((*v.shape, 3))
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
+    return out
+
+
+def motion_transform(R_b_a: FloatArray, p_a_b: FloatArray) -> FloatArray:
+    """``X`` that turns a motion vector in frame a into frame b: ``[[R, -R S(p)], [0, R]]``.
+
+    Its transpose turns a wrench in frame b into frame a.
+
+    Parameters
+    ----------
+    R_b_a : (..., 3, 3) ndarray
+    p_a_b : (..., 3) ndarray
+        Origin of b in a, m.
+    """
+    out = np.zeros((*np.broadcast_shapes(R_b_a.shape[:-2], p_a_b.shape[:-1]), 6, 6))
+    out[..., :3, :3] = out[..., 3:, 3:] = R_b_a
+    out[..., :3, 3:] = -R_b_a @ skew(p_a_b)
+    return out
+
+
+def rotate(R: FloatArray, v: FloatArray) -> FloatArray:
+    """``R v`` for stacks (..., 3, 3) and (..., 3)."""
+    return np.asarray((R @ v[..., None])[..., 0])
+
+
+def rotate_back(R: FloatArray, v: FloatArray) -> FloatArray:
+    """``R' v`` for stacks (..., 3, 3) and (..., 3)."""
+    return np.asarray((np.swapaxes(R, -1, -2) @ v[..., None])[..., 0])
+
+
+def spatial_inertia(mass: FloatArray, com: FloatArray, inertia: FloatArray) -> FloatArray:
+    """``I = [[m 1, -m S(c)], [m S(c), I_c - m S(c) S(c)]]`` about the link's origin.
+
+    Parameters
+    ----------
+    mass : (...,) ndarray
+        kg.
+    com : (..., 3) ndarray
+        Centre of mass in the link's frame, m.
+    inertia : (..., 3, 3) ndarray
+        About the centre of mass, in the link's axes, kg m^2.
+    """
+    S = skew(com)
+    out = np.zeros((*mass.shape, 6, 6))
+    out[..., :3, :3] = mass[..., None, None] * np.eye(3)
+    out[..., :3, 3:] = -mass[..., None, None] * S
+    out[..., 3:, :3] = mass[..., None, None] * S
+    out[..., 3:, 3:] = inertia - mass[..., None, None] * (S @ S)
+    return out
+
+
+def cross_force(v: FloatArray, f: FloatArray) -> FloatArray:
+    """``v x* f = [w x f_lin; v_lin x f_lin + w x f_ang]`` for (..., 6)."""
+    linear, angular = v[..., :3], v[..., 3:]
+    force, moment = f[..., :3], f[..., 3:]
+    return np.concatenate([np.cross(angular, force), np.cross(linear, force) + np.cross(angular, moment)], axis=-1)
+
+
+def cross_motion(v: FloatArray, m: FloatArray) -> FloatArray:
+    """``v x m = [w x m_lin + v_lin x m_ang; w x m_ang]`` for (..., 6)."""
+    linear, angular = v[..., :3], v[..., 3:]
+    first, second = m[..., :3], m[..., 3:]
+    return np.concatenate([np.cross(angular, first) + np.cross(linear, second), np.cross(angular, second)], axis=-1)
