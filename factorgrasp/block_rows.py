@@ -50,7 +50,9 @@ class BlockRows:
                     raise InputError(f"{block.name}", f"variables among {known}", repr(variable))
                 size = columns[variable].stop - columns[variable].start
                 if pattern.shape != (block.rows, size):
-                    raise InputError(f"{block.name}/{variable} pattern", f"shape {(block.rows, size)}", str(pattern.shape))
+                    raise InputError(
+                        f"{block.name}/{variable} pattern", f"shape {(block.rows, size)}", str(pattern.shape)
+                    )
                 rows, cols = np.nonzero(pattern)
                 row_parts.append(rows + start)
                 column_parts.append(cols + columns[variable].start)
@@ -95,7 +97,9 @@ class BlockRows:
         where = self._rows(name)
         value = np.asarray(rhs, dtype=float)
         if value.ndim and value.shape != (where.stop - where.start,):
-            raise InputError(f"{name} right-hand side", f"shape ({where.stop - where.start},)", str(value.shape))
+            raise InputError(
+                f"{name} right-hand side", f"shape ({where.stop - where.start},)", str(value.shape)
+            )
         self.rhs[where] = value
 
     def set_block(self, name: str, variable: str, value: ArrayLike | sp.sparray) -> None:

@@ -50,7 +50,7 @@ def to_dict(estimate: Estimate) -> JsonDict:
         "objective": estimate.objective,
         "iterations": estimate.iterations,
         "variables": variables,
-        "terms": [asdict(term) for term in estimate.residuals],
+        "residuals": [asdict(term) for term in estimate.residuals],
         "observability": None if estimate.observability is None else estimate.observability.to_dict(),
         "certificate": None if estimate.certificate is None else asdict(estimate.certificate),
         "multipliers": {name: np.asarray(value).tolist() for name, value in estimate.multipliers.items()},
@@ -95,31 +95,11 @@ def load(directory: Path) -> Estimate:
         raise InputError(str(directory), "files that Estimate.save wrote", str(error)) from None
     if stored.get("format") != FORMAT:
         raise InputError(str(path), f"the format {FORMAT!r}", repr(stored.get("format")))
-    variables = tuple(
-        Variable(v["name"], v["size"], v["manifold"], v["unit"], tuple(v["components"]), v["resolution"])
-        for v in stored["variables"]
-    )
-    certificate = stored["certificate"]
-    return Estimate(
-        status=Status(stored["status"]),
-        kind=stored["kind"],
-        solver=stored["solver"],
-        variables=variables,
-        values={v.name: arrays[f"value/{v.name}"] for v in variables},
-        message=stored["message"],
-        residuals=tuple(TermSummary(**_numbers(term)) for term in stored["terms"]),
-        observability=_observability(stored["observability"]),
-        objective=_number(stored["objective"]),
-        iterations=stored["iterations"],
-        certificate=None if certificate is None else Certificate(**_numbers(certificate)),
-        timing=_numbers(stored["timing"]),
-        versions=stored["versions"],
-        problem_hash=stored["problem_hash"],
-        multipliers={
-            k.removeprefix("multiplier/"): v for k, v in arrays.items() if k.startswith("multiplier/")
-        },
-        covariance_source=_stored_covariance(variables, arrays),
-    )
+    try:
+        return _estimate(stored, arrays)
+    except KeyError as error:
+        words = f"files without {error}"
+        raise InputError(str(directory), "files that Estimate.save wrote", words) from None
 
 
 def to_dataframe(estimate: Estimate) -> Any:
@@ -181,6 +161,35 @@ def to_xarray(estimate: Estimate) -> Any:
 
 
 # ---- internals --------------------------------------------------------------------------------------------------
+
+
+def _estimate(stored: JsonDict, arrays: dict[str, FloatArray]) -> Estimate:
+    """The estimate that the two files hold."""
+    variables = tuple(
+        Variable(v["name"], v["size"], v["manifold"], v["unit"], tuple(v["components"]), v["resolution"])
+        for v in stored["variables"]
+    )
+    certificate = stored["certificate"]
+    return Estimate(
+        status=Status(stored["status"]),
+        kind=stored["kind"],
+        solver=stored["solver"],
+        variables=variables,
+        values={v.name: arrays[f"value/{v.name}"] for v in variables},
+        message=stored["message"],
+        residuals=tuple(TermSummary(**_numbers(term)) for term in stored["residuals"]),
+        observability=_observability(stored["observability"]),
+        objective=_number(stored["objective"]),
+        iterations=stored["iterations"],
+        certificate=None if certificate is None else Certificate(**_numbers(certificate)),
+        timing=_numbers(stored["timing"]),
+        versions=stored["versions"],
+        problem_hash=stored["problem_hash"],
+        multipliers={
+            k.removeprefix("multiplier/"): v for k, v in arrays.items() if k.startswith("multiplier/")
+        },
+        covariance_source=_stored_covariance(variables, arrays),
+    )
 
 
 def _finite(value: Any) -> Any:

@@ -286,22 +286,17 @@ def _pose_agreement(estimate: GraspFromPosesEstimate) -> Section:
     d = estimate.diagnostics
     declared = np.sqrt(np.diag(d.noise_covariance))
     order = np.argsort(d.t)
-    t, step = d.t[order], float(np.median(np.diff(d.t[order])))
+    t, turn, shift = d.t[order], np.degrees(d.rotation_residual[order]), 1000.0 * d.position_residual[order]
     panels = [
-        (
-            "Rotation",
-            "°",
-            t,
-            np.degrees(np.abs(d.rotation_residual[order])),
-            float(np.degrees(_rms(declared[:3]))),
-        ),
-        ("Position", "mm", t, 1000.0 * np.abs(d.position_residual[order]), 1000.0 * _rms(declared[3:])),
+        ("Rotation", "°", t, np.abs(turn), float(np.degrees(_rms(declared[:3])))),
+        ("Position", "mm", t, np.abs(shift), 1000.0 * _rms(declared[3:])),
     ]
     return Section(
         "How well both sides agree",
         f"{d.samples_used} samples of the {d.sampled} side were compared, {d.samples_dropped} lie beside a gap or outside of the other "
         f"recording and were left out. Both sides differ by {quantity(d.rotation_rms, 'rad')} and {quantity(d.position_rms, 'm')} "
         "(root mean square).",
-        svg=plots.to_svg(plots.over_time(panels, 5.0 * step), "agreement"),
-        caption="Size of the difference along each axis of the hand, against the standard deviation with which it was weighted.",
+        svg=plots.to_svg(plots.over_time(panels, 5.0 * float(np.median(np.diff(t)))), "agreement"),
+        caption="Size of the difference along each axis of the hand (root mean square in short stretches of time), against the standard "
+        "deviation with which it was weighted.",
     )

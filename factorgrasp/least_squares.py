@@ -113,7 +113,9 @@ class LeastSquares:
         self.columns = slices(self.variables)
         self.size = sum(variable.size for variable in self.variables)
         sizes = {variable.name: variable.size for variable in self.variables}
-        self.jacobian = BlockRows([_row_block(term, sizes, term.covariance.block_size) for term in terms], self.columns, self.size)
+        self.jacobian = BlockRows(
+            [_row_block(term, sizes, term.covariance.block_size) for term in terms], self.columns, self.size
+        )
         self.equalities = BlockRows(
             [_row_block(c, sizes) for c in constraints if c.kind == "equality"], self.columns, self.size
         )
@@ -147,7 +149,10 @@ class LeastSquares:
     def set_bounds(self, variable: str, lower: ArrayLike = -np.inf, upper: ArrayLike = np.inf) -> None:
         """Bounds on the (tangent) components of a variable, scalars or (size,)."""
         where = self._column(variable)
-        low, high = np.broadcast_to(lower, self.lower[where].shape), np.broadcast_to(upper, self.upper[where].shape)
+        low, high = (
+            np.broadcast_to(lower, self.lower[where].shape),
+            np.broadcast_to(upper, self.upper[where].shape),
+        )
         if np.any(np.isnan(low)) or np.any(np.isnan(high)) or np.any(low > high):
             raise InputError(f"bounds of {variable}", "lower <= upper", f"{low} and {high}")
         self.lower[where], self.upper[where] = low, high
@@ -229,7 +234,9 @@ class LeastSquares:
     @property
     def has_inequalities(self) -> bool:
         """Whether there is any inequality or finite bound."""
-        return bool(self.inequalities.height or np.any(np.isfinite(self.lower)) or np.any(np.isfinite(self.upper)))
+        return bool(
+            self.inequalities.height or np.any(np.isfinite(self.lower)) or np.any(np.isfinite(self.upper))
+        )
 
     @property
     def robust(self) -> bool:

@@ -87,7 +87,9 @@ def default_words(variable: Variable, vector: FloatArray) -> str:
     order = np.argsort(-np.abs(vector), kind="stable")
     large = int(np.count_nonzero(np.abs(vector) > 0.2))
     shown = order[: min(max(large, 3), 6)]
-    parts = [f"{vector[i]:+.2f} {variable.labels[i]}" for i in shown if abs(vector[i]) > (0.2 if large else 0.0)]
+    parts = [
+        f"{vector[i]:+.2f} {variable.labels[i]}" for i in shown if abs(vector[i]) > (0.2 if large else 0.0)
+    ]
     # Rounded to nothing they would say nothing: a direction spread over many components names its largest ones.
     rest = 1.0 - float(np.sum(vector[shown] ** 2)) > 0.2
     return f"{variable.name} along " + " ".join(parts) + (" ..." if rest else "")

@@ -33,6 +33,8 @@ PALETTE: Mapping[str, str] = {
 }
 AXES = ("x", "y", "z")
 
+_MOST_POINTS = 600
+
 # matplotlib types its settings by a literal of all their names; a plain mapping is clearer here.
 _STYLE: Any = {
     "font.size": 9.0,
@@ -147,7 +149,12 @@ def draw_over_time(
     width : float
         s; windows further apart than this have a gap between them, and the line breaks.
     """
-    times, values = _broken(t, level.reshape(t.size, -1), width)
+    level = level.reshape(t.size, -1)
+    if t.size > _MOST_POINTS:
+        # A picture has room for some hundred points, a recording may have a million.
+        t, level = rms_per_stretch(t, level)
+        width = max(width, 1.5 * float(np.min(np.diff(t))))
+    times, values = _broken(t, level, width)
     for k in range(values.shape[1]):
         single = values.shape[1] == 1
         ax.plot(
@@ -174,6 +181,16 @@ def _legend_above(ax: Axes) -> None:
         handlelength=1.4,
         columnspacing=1.2,
     )
+
+
+def rms_per_stretch(t: FloatArray, values: FloatArray, stretches: int = 300) -> tuple[FloatArray, FloatArray]:
+    """RMS of the columns of `values` (n, k) in equal stretches of time: centres (m,) and RMS (m, k) of those with samples."""
+    edges = np.linspace(float(t[0]), float(t[-1]), stretches + 1)
+    where = np.clip(np.searchsorted(edges, t, side="right") - 1, 0, stretches - 1)
+    count = np.bincount(where, minlength=stretches)
+    filled = count > 0
+    power = [np.bincount(where, weights=column**2, minlength=stretches)[filled] for column in values.T]
+    return 0.5 * (edges[1:] + edges[:-1])[filled], np.sqrt(np.stack(power, axis=1) / count[filled, None])
 
 
 def _broken(t: FloatArray, values: FloatArray, width: float) -> tuple[FloatArray, FloatArray]:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from enum import Enum
+from enum import StrEnum
 
 
-class Status(str, Enum):
+class Status(StrEnum):
     """End of a solve. Only `SOLVED` values may be used without a second look."""
 
     SOLVED = "solved"

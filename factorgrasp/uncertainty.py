@@ -67,7 +67,7 @@ class Covariance:
             ) from None
         # W = L^-1 is lower triangular; its QR gives the upper-triangular root of the same information.
         inverse = np.linalg.solve(lower, np.broadcast_to(np.eye(values.shape[1]), values.shape).copy())
-        return cls("blocks", np.linalg.qr(inverse, mode="r"))
+        return cls("blocks", np.asarray(np.linalg.qr(inverse, mode="r")))
 
     @classmethod
     def sqrt_information(cls, root: ArrayLike, field: str = "sqrt_information") -> Covariance:

@@ -48,7 +48,9 @@ class Variable:
         if self.size < 1 or self.size != needed:
             raise InputError(f"variable {self.name}", f"a size of {max(needed, 1)}", str(self.size))
         if self.components and len(self.components) != self.size:
-            raise InputError(f"variable {self.name}", f"{self.size} component names", str(len(self.components)))
+            raise InputError(
+                f"variable {self.name}", f"{self.size} component names", str(len(self.components))
+            )
 
     @property
     def labels(self) -> tuple[str, ...]:

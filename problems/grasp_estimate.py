@@ -239,11 +239,21 @@ class GraspPoseEstimate:
             "windows_dropped": d.windows_dropped,
             "window_seconds": d.window_seconds,
             "samples_used": d.samples_used,
-            "robot": {"gaps": d.robot_gaps[0], "seconds_missing": d.robot_gaps[1], "incomplete_rows": d.robot_gaps[2]},
-            "hand": {"gaps": d.hand_gaps[0], "seconds_missing": d.hand_gaps[1], "incomplete_rows": d.hand_gaps[2]},
+            "robot": {
+                "gaps": d.robot_gaps[0],
+                "seconds_missing": d.robot_gaps[1],
+                "incomplete_rows": d.robot_gaps[2],
+            },
+            "hand": {
+                "gaps": d.hand_gaps[0],
+                "seconds_missing": d.hand_gaps[1],
+                "incomplete_rows": d.hand_gaps[2],
+            },
             "clock_correlation": d.clock_correlation,
             "bandwidth_hz": d.bandwidth,
-            "kinematics_bandwidth_hz": d.kinematics_bandwidth if np.isfinite(d.kinematics_bandwidth) else None,
+            "kinematics_bandwidth_hz": d.kinematics_bandwidth
+            if np.isfinite(d.kinematics_bandwidth)
+            else None,
         }
         return out
 
@@ -294,12 +304,17 @@ def _triple(values: FloatArray, digits: int) -> str:
 
 def _summaries(estimate: Estimate, problem: GraspPose, state: object) -> tuple[TermSummary, ...]:
     """Residual summaries counted in independent numbers of the recording, not in compressed rows."""
-    rows = round(3.0 * float(problem.moments.dof.sum()))
+    dof = problem.moments.dof.sum(axis=0)
+    counts = {
+        "gyroscope": round(3.0 * float(dof.sum())),
+        "accelerometer": round(3.0 * float(dof[problem.variances.trusted].sum())),
+    }
     weights = problem.diagnostics(state).window_weight  # type: ignore[arg-type]
     relative = weights / max(float(weights.max()), 1e-300)
     out = []
     for term in estimate.residuals:
-        if term.name in ("gyroscope", "accelerometer"):
+        if term.name in counts:
+            rows = counts[term.name]
             rms = float(np.sqrt(term.chi2 / max(rows, 1)))
             down = float(np.mean(relative < 0.5)) if problem.settings.loss != "none" else 0.0
             out.append(replace(term, rows=rows, rms=rms, worst=rms, down_weighted=down))

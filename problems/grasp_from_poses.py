@@ -196,7 +196,9 @@ class GraspPoseFromPoses:
     def initial_state(self) -> State:
         """Wahba on relative rotations, means and linear least squares for the rest (mathematics 2.3); a refined problem goes on."""
         if self._start is None:
-            self._start = self._known(start_state(self._coupling, self._samples, self.clock.offset))
+            self._start = self._known(
+                start_state(self._coupling, self._samples, self.clock.offset, self.prior.translation)
+            )
             self._held = self._hold(self._start)
         return dict(self._start)
 

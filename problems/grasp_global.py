@@ -1,8 +1,9 @@
 """Is the rotation found the best there is? The grasp cost as a quadratic in the rotation's entries alone.
 
-With clocks and sensor calibration held at their estimates, both residuals are linear in ``y = [vec R, r, c_g, c_a, tilt, 1]``, ``c = M b``: the cost is ``y' G y``.
-Eliminating everything but ``x = [vec R, 1]`` (Schur complement) leaves ``x' Q x`` over SO(3), for which
-:mod:`factorgrasp.rotation_relaxation` has a certificate and a relaxation (mathematics 2.3).
+With clocks and sensor calibration held at their estimates, both residuals are linear in ``y = [vec R, r, c_g,
+c_a, tilt, 1]``, ``c = M b``: the cost is ``y' G y``. Eliminating everything but ``x = [vec R, 1]`` (Schur
+complement) leaves ``x' Q x`` over SO(3), for which :mod:`factorgrasp.rotation_relaxation` has a certificate
+and a relaxation (mathematics 2.3).
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """The robot side of the grasp problem: body rate, acceleration and specific force of the end-effector on a uniform grid.
 
-Whatever the robot offers (poses, an IMU, motion, joint positions) becomes ``w_r, al_r, f_r = R_w_r'(a_w - g)`` in the end-effector frame, with the
-noise that its differentiation leaves in them as a function of frequency.
+Whatever the robot offers (poses, an IMU, motion, joint positions) becomes ``w_r, al_r, f_r = R_w_r'(a_w -
+g)`` in the end-effector frame, with the noise that its differentiation leaves in them as a function of
+frequency.
 """
 
 from __future__ import annotations
@@ -20,8 +21,9 @@ from factorgrasp.typing import FloatArray
 
 RobotStream = PoseStream | MotionStream | ImuStream | JointStream
 
-# Order 4: the second derivative then keeps a flat passband (its error grows with f^4), at the price of some more noise.
-_ORDER = 4
+# Order 4: the second derivative then keeps a flat passband (its error grows with f^4), at the price of some
+# more noise.
+DERIVATIVE_ORDER = 4
 # Steps of a stream that is called uniform differ by less than this part of the median step.
 _UNIFORM = 0.02
 _NOISE_BLOCK, _NOISE_BLOCKS = 512, 16
@@ -119,7 +121,8 @@ def robot_kinematics(
 def gap_limit(t: FloatArray, max_gap: float | None) -> float:
     """Longest step (s) between two good samples that is not a gap.
 
-    1.6 median steps for a stream with a steady clock, so that one missing sample is a gap already; 3 for one with jittered stamps.
+    1.6 median steps for a stream with a steady clock, so that one missing sample is a gap already; 3 for one
+    with jittered stamps.
     """
     if max_gap is not None:
         return max_gap
@@ -150,11 +153,11 @@ def on_grid(t: FloatArray, x: FloatArray, grid: FloatArray, same: bool, limit: f
 
 def differentiator(bandwidth: float, step: float, samples: int, field: str) -> tuple[int, float]:
     """Savitzky-Golay window for a second derivative of about this bandwidth, and the bandwidth that it really has (Hz)."""
-    window = signals.choose_savgol(min(bandwidth, 0.35 / step), step, _ORDER, deriv=2)
-    window = max(window, _ORDER + 3)
+    window = signals.choose_savgol(min(bandwidth, 0.35 / step), step, DERIVATIVE_ORDER, deriv=2)
+    window = max(window, DERIVATIVE_ORDER + 3)
     if samples < 2 * window:
         raise InputError(field, f"at least {2 * window} samples to differentiate", f"{samples}")
-    return window, signals.savgol_bandwidth(window, _ORDER, step, deriv=2)
+    return window, signals.savgol_bandwidth(window, DERIVATIVE_ORDER, step, deriv=2)
 
 
 def white_noise_sd(x: FloatArray, order: int = 6) -> float:
@@ -175,9 +178,11 @@ def _from_poses(
     robot: PoseStream, noise: GraspNoise, gravity: FloatArray, bandwidth: float, limit: float
 ) -> RobotKinematics:
     grid, same = uniform_grid(robot.t)
-    quaternion = np.array(robot.rotation_wxyz) if same else signals.resample_rotations(
-        robot.t, robot.rotation_wxyz, grid, max_gap=limit, kind="cubic"
-    )[1]
+    quaternion = (
+        np.array(robot.rotation_wxyz)
+        if same
+        else signals.resample_rotations(robot.t, robot.rotation_wxyz, grid, max_gap=limit, kind="cubic")[1]
+    )
     position = on_grid(robot.t, robot.position, grid, same, limit)
     missing = ~(np.isfinite(position).all(axis=1) & np.isfinite(quaternion).all(axis=1))
     if missing.any():
@@ -205,19 +210,20 @@ def _from_uniform_poses(
 ) -> RobotKinematics:
     step = float((grid[-1] - grid[0]) / (grid.size - 1))
     window, reached = differentiator(bandwidth, step, grid.size, f"{name} stream")
-    motion = signals.differentiate_rotations(quaternion, step, window, _ORDER)
-    acceleration = signals.savgol_derivatives(position, step, window, _ORDER, 2)
+    motion = signals.differentiate_rotations(quaternion, step, window, DERIVATIVE_ORDER)
+    acceleration = signals.savgol_derivatives(position, step, window, DERIVATIVE_ORDER, 2)
     rotation = lie.quaternion_wxyz_to_matrix(motion.rotation)
     force = to_body(rotation, acceleration - gravity)
 
     def densities(f: FloatArray) -> RobotNoise:
-        gain = [signals.savgol_frequency_response(window, _ORDER, d, step, f) for d in (0, 1, 2)]
+        gain = [signals.savgol_frequency_response(window, DERIVATIVE_ORDER, d, step, f) for d in (0, 1, 2)]
         position_psd, rotation_psd = position_sd**2 * step, rotation_sd**2 * step
         pull = float(np.nanmean(np.sum(force**2, axis=1)))
         return RobotNoise(
             angular_velocity=np.abs(gain[1]) ** 2 * rotation_psd,
             angular_acceleration=np.abs(gain[2]) ** 2 * rotation_psd,
-            specific_force=np.abs(gain[2]) ** 2 * position_psd + np.abs(gain[0]) ** 2 * rotation_psd * pull / 1.5,
+            specific_force=np.abs(gain[2]) ** 2 * position_psd
+            + np.abs(gain[0]) ** 2 * rotation_psd * pull / 1.5,
             force_by_acceleration=np.real(gain[0] * np.conj(gain[2])) * rotation_psd,
         )
 
@@ -249,9 +255,13 @@ def _from_motion(robot: MotionStream, noise: GraspNoise, limit: float) -> RobotK
     rate, acceleration, force = (on_grid(robot.t, part, grid, same, limit) for part in parts)
     rotation = None
     if robot.rotation_wxyz is not None:
-        quaternion = robot.rotation_wxyz if same else signals.resample_rotations(
-            robot.t, robot.rotation_wxyz, grid, max_gap=limit, kind="cubic"
-        )[1]
+        quaternion = (
+            robot.rotation_wxyz
+            if same
+            else signals.resample_rotations(robot.t, robot.rotation_wxyz, grid, max_gap=limit, kind="cubic")[
+                1
+            ]
+        )
         rotation = lie.quaternion_wxyz_to_matrix(quaternion)
     declared = (
         noise.robot_angular_velocity_density,
@@ -274,14 +284,16 @@ def _from_imu(robot: ImuStream, noise: GraspNoise, bandwidth: float, limit: floa
     rate = on_grid(robot.t, robot.angular_velocity, grid, same, limit)
     force = on_grid(robot.t, robot.specific_force, grid, same, limit)
     window, reached = differentiator(bandwidth, step, grid.size, f"{robot.name} stream")
-    smooth = signals.savgol_derivatives(rate, step, window, _ORDER, 0)
-    acceleration = signals.savgol_derivatives(rate, step, window, _ORDER, 1)
+    smooth = signals.savgol_derivatives(rate, step, window, DERIVATIVE_ORDER, 0)
+    acceleration = signals.savgol_derivatives(rate, step, window, DERIVATIVE_ORDER, 1)
     own = noise.robot_angular_velocity_density, noise.robot_acceleration_density
     rate_psd = (noise.gyro_density if own[0] is None else own[0]) ** 2
     force_psd = (noise.accelerometer_density if own[1] is None else own[1]) ** 2
 
     def densities(f: FloatArray) -> RobotNoise:
-        gain = [np.abs(signals.savgol_frequency_response(window, _ORDER, d, step, f)) for d in (0, 1)]
+        gain = [
+            np.abs(signals.savgol_frequency_response(window, DERIVATIVE_ORDER, d, step, f)) for d in (0, 1)
+        ]
         return RobotNoise(gain[0] ** 2 * rate_psd, gain[1] ** 2 * rate_psd, force_psd + 0.0 * f, 0.0 * f)
 
     return RobotKinematics(grid, smooth, acceleration, force, None, densities, reached)
@@ -300,7 +312,9 @@ def _from_joints(
 
     if robot_model is None or frame is None:
         raise InputError(
-            "robot", "a robot model (urdf) and the name of the end-effector's frame with joint positions", "none"
+            "robot",
+            "a robot model (urdf) and the name of the end-effector's frame with joint positions",
+            "none",
         )
     grid, same = uniform_grid(robot.t)
     q = on_grid(robot.t, robot.q, grid, same, limit)

@@ -1,15 +1,18 @@
 """The rigid coupling of robot and hand as residuals that are linear in second-moment entries.
 
-With ``R = R_r_h``, ``r = p_r_h`` and ``phi(w, al) = S(al) + S(w)^2`` (mathematics 2.1, Cehajic 2015 (10), (12)-(14) in corrected form)
+With ``R = R_r_h``, ``r = p_r_h`` and ``phi(w, al) = S(al) + S(w)^2`` (mathematics 2.1, Cehajic 2015 (10),
+(12)-(14) in corrected form)
 
-    e_g = w_r - M_g (w_h + tau dw_h) + M_g b_g                                    (gyroscope)
-    e_a = f_r + phi r - M_a (f_h + tau_a df_h - b_a) - R_w_r' E tilt              (accelerometer, specific force on both sides)
+    e_g = w_r - M_g (w_h + tau dw_h) + M_g b_g                                    (gyroscope) e_a = f_r + phi
+    r - M_a (f_h + tau_a df_h - b_a) - R_w_r' E tilt              (accelerometer, specific force on both
+    sides)
 
-where ``M = R (I + C)`` carries the scale and misalignment errors C of the hand's sensor axes and ``tau_a = tau + delay``. Both are ``L(x) z`` with the
-measured ``z`` below, so that second moments of z hold all that a recording says:
+where ``M = R (I + C)`` carries the scale and misalignment errors C of the hand's sensor axes and ``tau_a =
+tau + delay``. Both are ``L(x) z`` with the measured ``z`` below, so that second moments of z hold all that a
+recording says:
 
-    z_g = [w_r (3), w_h (3), dw_h (3), 1]
-    z_a = [f_r (3), al_r (3), vech(w_r w_r') (6), f_h (3), df_h (3), 1, R_w_r' E (3 + 3, when the tilt is estimated)]
+    z_g = [w_r (3), w_h (3), dw_h (3), 1] z_a = [f_r (3), al_r (3), vech(w_r w_r') (6), f_h (3), df_h (3), 1,
+    R_w_r' E (3 + 3, when the tilt is estimated)]
 """
 
 from __future__ import annotations
@@ -53,7 +56,8 @@ def _symmetric_matrices() -> FloatArray:
 _V = _vech_matrices()
 _SKEW = lie.skew(np.eye(3))
 _FULL = _unit_matrices()
-# A rotation of the gyroscope's axes is what R itself means, so only the symmetric part of its errors is a parameter.
+# A rotation of the gyroscope's axes is what R itself means, so only the symmetric part of its errors is a
+# parameter.
 _SYMMETRIC = _symmetric_matrices()
 
 

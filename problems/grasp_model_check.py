@@ -1,12 +1,17 @@
-"""Does the rigid-coupling model hold on this recording? If not, how much wider is the truth than the noise model says?
+"""Whether the rigid-coupling model holds on a recording, and how much wider the truth is where it does not.
 
-Real grasps give way a little, clocks drift, and poses that were interpolated from few samples carry no acceleration. Such errors do not average out like noise,
-so a covariance from noise alone would be too small. Three tests look for them; the first two do nothing to a sound recording 99 times out of 100:
+Real grasps give way a little, clocks drift, and poses that were interpolated from few samples carry no
+acceleration. Such errors do not average out like noise, so a covariance from noise alone would be too small.
+Three tests look for them; the first two do nothing to a sound recording 99 times out of 100:
 
-- *stretches*: the scores of separate stretches of time scatter more than their covariance (a slow drift of the grasp);
-- *bands*: the lever arms that separate frequency bands ask for differ more than their covariances (wrong accelerations);
-- *phantom motion*: at frequencies without hand motion the robot's stream shows rates far above its declared noise (poses interpolated from few
-  samples, or with jittered stamps). Its error is then no noise at all frequencies, and what it may do to the lever arm is bounded, not averaged.
+- *stretches*: the scores of separate stretches of time scatter more than their covariance (a slow drift of
+  the grasp);
+- *bands*: the lever arms that separate frequency bands ask for differ more than their covariances (wrong
+  accelerations);
+- *phantom motion*: at frequencies without hand motion the robot's stream shows rates far above its declared
+  noise (poses interpolated from few
+  samples, or with jittered stamps). Its error is then no noise at all frequencies, and what it may do to the
+  lever arm is bounded, not averaged.
 """
 
 from __future__ import annotations
@@ -23,7 +28,8 @@ from factorgrasp.typing import FloatArray, IntArray, State
 
 _PROBABILITY = 0.99
 _FEWEST_STRETCHES = 6
-# Phantom motion: residual rate this many times the hand's own power and the declared noise, in at least half of the bins that are not trusted.
+# Phantom motion: residual rate this many times the hand's own power and the declared noise, in at least half
+# of the bins that are not trusted.
 _PHANTOM_OVER_HAND = 5.0
 _PHANTOM_OVER_NOISE = 3.0
 
@@ -37,7 +43,8 @@ class ModelCheck:
     scale : (n,) ndarray
         Factor on the variance of every unknown from the stretches' scatter; 1 where nothing was found.
     lever_arm_excess : (3, 3) ndarray
-        Covariance (m^2) to add to the lever arm for the disagreement of frequency bands; zero where nothing was found.
+        Covariance (m^2) to add to the lever arm for the disagreement of frequency bands; zero where nothing
+        was found.
     band_spread : float
         m; scatter of the lever arm between bands beyond noise.
     phantom : float
@@ -132,7 +139,9 @@ def _phantom_bound(
     dof = 3.0 * moments.dof.sum(axis=0)
     residual = np.einsum("ij,kjl,il->k", L_g, Z_g, L_g)
     hand = np.einsum("kii->k", Z_g[:, 3:6, 3:6])
-    phantom = (residual > _PHANTOM_OVER_HAND * hand) & (residual > _PHANTOM_OVER_NOISE * dof * expected.gyro_variance)
+    phantom = (residual > _PHANTOM_OVER_HAND * hand) & (
+        residual > _PHANTOM_OVER_NOISE * dof * expected.gyro_variance
+    )
     if np.mean(phantom[untrusted]) < 0.5:
         return 0.0
     moving = variances.trusted.copy()
@@ -146,12 +155,17 @@ def _phantom_bound(
 
 
 def _stretch_scale(
-    model: GraspModel, state: State, moments: Moments, variances: BandVariances, information: FloatArray, meat: FloatArray
+    model: GraspModel,
+    state: State,
+    moments: Moments,
+    variances: BandVariances,
+    information: FloatArray,
+    meat: FloatArray,
 ) -> FloatArray:
     """Ratio of the variance from scattering scores ``[H^-1 S H^-1]_ii`` to the modelled one where it is significant, else 1.
 
-    Stretches are also merged by two and three, since slow drifts show only over long stretches. Axes of a rotation or a lever arm
-    are a matter of convention, so the worst of the three counts for all.
+    Stretches are also merged by two and three, since slow drifts show only over long stretches. Axes of a
+    rotation or a lever arm are a matter of convention, so the worst of the three counts for all.
     """
     from scipy.stats import chi2
 
@@ -164,7 +178,10 @@ def _stretch_scale(
     Z_g = np.tensordot(moments.gyro, w_g, axes=(1, 0))
     Z_a = np.tensordot(moments.accelerometer, w_a, axes=(1, 0))
     scores = np.array(
-        [quadratic_forms(L_g, J_g, g)[1] + quadratic_forms(L_a, J_a, a)[1] for g, a in zip(Z_g, Z_a, strict=True)]
+        [
+            quadratic_forms(L_g, J_g, g)[1] + quadratic_forms(L_a, J_a, a)[1]
+            for g, a in zip(Z_g, Z_a, strict=True)
+        ]
     )
     bread = floored_inverse(information)
     modelled = np.diag(bread @ meat @ bread)
@@ -190,9 +207,12 @@ def _band_excess(
     precision: FloatArray,
     information: FloatArray,
 ) -> tuple[FloatArray, float]:
-    """Excess covariance of the lever arm and its spread between bands: every band with the gyroscope and the priors, but without the others."""
+    """Excess covariance of the lever arm and its spread between bands.
+
+    Every band is solved with the gyroscope and the priors, but without the other bands.
+    """
     where = model.columns["translation"]
-    (L_g, L_a), (J_g, J_a) = model.matrices(state), model.jacobians(state)
+    L_a, J_a = model.matrices(state)[1], model.jacobians(state)[1]
     w_a = variances.weights[1]
     Z = moments.accelerometer.sum(axis=0)
     if expected is not None:
@@ -221,10 +241,11 @@ def _band_excess(
 
 
 def _disagreement(arms: FloatArray, covariances: FloatArray) -> tuple[FloatArray, float]:
-    """Excess covariance (3, 3) and largest spread (m) of lever arms (k, 3), relative to the estimate, that scatter more than their covariances.
+    """Excess covariance (3, 3) and largest spread (m) of lever arms (k, 3) that scatter more than they should.
 
-    Along each principal axis of the scatter where it is significant, every band moves the estimate by its own error times its share of the
-    information; the squares of these moves add up (the cluster-robust variance with bands for clusters).
+    Along each principal axis of the scatter where it is significant, every band moves the estimate by its own
+    error times its share of the information; the squares of these moves add up (the cluster-robust variance
+    with bands for clusters).
     """
     from scipy.stats import chi2
 

@@ -13,12 +13,13 @@ from factorgrasp.problems.grasp_settings import GraspNoise
 from factorgrasp.problems.grasp_windows import Moments, Windowing
 from factorgrasp.typing import BoolArray, FloatArray, State
 
-# Declared densities count as much as this many observed numbers when the residual power of a band is estimated: enough to
-# keep a recording of a second sane, too few to be noticed after ten.
+# Declared densities count as much as this many observed numbers when the residual power of a band is
+# estimated: enough to keep a recording of a second sane, too few to be noticed after ten.
 PRIOR_DOF = 6.0
 
-# Robot and hand turn as one body. Where their angular rates differ by more than this part of their power, the robot's rate is no measurement
-# of the motion, and its derivatives (angular and linear acceleration) even less; such a band holds nothing about the lever arm but false excitation.
+# Robot and hand turn as one body. Where their angular rates differ by more than this part of their power, the
+# robot's rate is no measurement of the motion, and its derivatives (angular and linear acceleration) even
+# less; such a band holds nothing about the lever arm but false excitation.
 LARGEST_DISAGREEMENT = 0.05
 
 
@@ -112,7 +113,9 @@ class BandVariances:
         if np.any(self.trusted != other.trusted):
             return float("inf")
         gyro = np.max(np.abs(self.gyro / other.gyro - 1.0))
-        accelerometer = np.max(np.abs(self.accelerometer / other.accelerometer - 1.0), where=self.trusted, initial=0.0)
+        accelerometer = np.max(
+            np.abs(self.accelerometer / other.accelerometer - 1.0), where=self.trusted, initial=0.0
+        )
         return float(max(gyro, accelerometer))
 
 
@@ -135,8 +138,9 @@ def estimated_variances(
 ) -> BandVariances:
     """Residual power of every band at `state`, and the bands in which both sides agree on the motion.
 
-    Restricted maximum likelihood with an inverse-gamma prior at the declared power; the numbers that the fit itself took from a band are
-    counted by its leverage ``tr(C J Z J') / variance``. Without `adapt` the declared powers stay.
+    Restricted maximum likelihood with an inverse-gamma prior at the declared power; the numbers that the fit
+    itself took from a band are counted by its leverage ``tr(C J Z J') / variance``. Without `adapt` the
+    declared powers stay.
     """
     L_g, L_a = model.matrices(state)
     J_g, J_a = model.jacobians(state)
@@ -146,7 +150,10 @@ def estimated_variances(
     half = vectors * np.sqrt(np.maximum(values, 0.0))
     out, powers = [], []
     w_g, w_a = current.weights
-    for L, J, Z, prior, weight in ((L_g, J_g, Z_g, declared.gyro, w_g), (L_a, J_a, Z_a, declared.accelerometer, w_a)):
+    for L, J, Z, prior, weight in (
+        (L_g, J_g, Z_g, declared.gyro, w_g),
+        (L_a, J_a, Z_a, declared.accelerometer, w_a),
+    ):
         power = np.einsum("ij,kjl,il->k", L, Z, L, optimize=True)
         spread = np.tensordot(half, J, axes=(0, 0)).reshape(-1, J.shape[2])
         leverage = np.einsum("ij,kjl,il->k", spread, Z, spread, optimize=True) * weight

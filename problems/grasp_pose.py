@@ -1,7 +1,8 @@
 """Grasp pose: rotation and lever arm between a robot's end-effector and the human hand on the same object.
 
-Model and estimator: mathematics 2.1 and 2.3 (after Cehajic 2015, in corrected form). Two IMU-level relations, linear in products of the measured
-signals, compressed to second moments per frequency band; see :mod:`factorgrasp.problems.grasp_model` and ``grasp_windows``.
+Model and estimator: mathematics 2.1 and 2.3 (after Cehajic 2015, in corrected form). Two IMU-level relations,
+linear in products of the measured signals, compressed to second moments per frequency band; see
+:mod:`factorgrasp.problems.grasp_model` and ``grasp_windows``.
 """
 
 from __future__ import annotations
@@ -59,9 +60,11 @@ from factorgrasp.typing import FloatArray, State
 
 # Stretches whose scores are compared by the model check: enough for a test, long enough to see slow drifts.
 STRETCHES = 12
-# The model is linear in the remaining offset; at this size the neglected second order is below 1e-4 of any signal up to 20 Hz.
+# The model is linear in the remaining offset; at this size the neglected second order is below 1e-4 of any
+# signal up to 20 Hz.
 SETTLED_OFFSET = 1e-4
-# Weights that change by less than this are settled, and so are estimates that new weights move by less than this many standard deviations.
+# Weights that change by less than this are settled, and so are estimates that new weights move by less than
+# this many standard deviations.
 SETTLED_WEIGHTS = 0.02
 SETTLED_STEP = 0.02
 SETTLED_ROBUST_STEP = 0.1
@@ -99,7 +102,8 @@ class GraspPose:
     Raises
     ------
     InputError
-        Naming the field, for recordings that do not overlap, are too short, or look like other units than declared.
+        Naming the field, for recordings that do not overlap, are too short, or look like other units than
+        declared.
     """
 
     kind = "grasp_pose"
@@ -143,7 +147,11 @@ class GraspPose:
         tilt = tilt_axes(self.gravity) if self.settings.base_tilt else None
         self._grid = coupling_grid(motion, hand.rate, bandwidth, self.settings.window, tilt)
         # Where the two sides do not turn together, clocks and sensor errors would only chase noise.
-        hopeless = frozenset((*SENSOR_ERRORS, "time_offset")) if self.clock.correlation < SMALLEST_CORRELATION else frozenset()
+        hopeless = (
+            frozenset((*SENSOR_ERRORS, "time_offset"))
+            if self.clock.correlation < SMALLEST_CORRELATION
+            else frozenset()
+        )
         self.model = GraspModel(*grasp_variables(self.noise, self.settings, hopeless))
         self._windows = self._couple(self.clock.offset)
         self._expected: NoiseMoments = noise_moments(
@@ -154,7 +162,9 @@ class GraspPose:
             self._grid.rate_moment,
             self.model.accelerometer_width,
         )
-        self.declared = declared_variances(self._expected, np.full(3, np.linalg.norm(self.prior.translation) or 0.5) / np.sqrt(3.0))
+        self.declared = declared_variances(
+            self._expected, np.full(3, np.linalg.norm(self.prior.translation) or 0.5) / np.sqrt(3.0)
+        )
         self._weights = GraspWeights(self.declared, self._forgetting(), self.clock.offset)
         self._moments = self._compress()
         self._pattern: LeastSquares | None = None
@@ -162,7 +172,8 @@ class GraspPose:
         self._trust: FloatArray | None = None
         self._pruned = False
 
-    # ---- the protocol of a nonlinear problem -----------------------------------------------------------------
+    # ---- the protocol of a nonlinear problem
+    # -----------------------------------------------------------------
 
     def initial_state(self) -> State:
         """Rotation by Wahba's closed form from the angular rates; everything else at its prior mean."""
@@ -174,7 +185,9 @@ class GraspPose:
     def linearize(self, state: State) -> LeastSquares:
         """Compressed rows: ``e = L(x) S`` with ``S S'`` the weighted, noise-corrected moments, and one row a prior component."""
         if self._pattern is None:
-            self._pattern = least_squares_pattern(self.model, prior_precision(self.model, self.noise, self.prior))
+            self._pattern = least_squares_pattern(
+                self.model, prior_precision(self.model, self.noise, self.prior)
+            )
         L_g, L_a = self.model.matrices(state)
         J_g, J_a = self.model.jacobians(state)
         Z_g, Z_a = self.corrected_moments()
@@ -191,7 +204,9 @@ class GraspPose:
 
     def retract(self, state: State, step: FloatArray) -> State:
         """Move the state by a tangent step (n,)."""
-        return {v.name: v.retract(state[v.name], step[self.model.columns[v.name]]) for v in self.model.variables}
+        return {
+            v.name: v.retract(state[v.name], step[self.model.columns[v.name]]) for v in self.model.variables
+        }
 
     def refine(self, state: State) -> GraspPose | None:
         """The problem with clocks shifted by the offset found and bands re-weighted by their residual power; None when settled."""
@@ -229,7 +244,9 @@ class GraspPose:
         changed = variances.change_from(self._weights.variances) > SETTLED_WEIGHTS
         if robust is not None:
             before = 1.0 if self._weights.windows is None or moved else self._weights.windows
-            changed |= bool(np.max(np.abs((windows if windows is not None else 1.0) - before)) > SETTLED_WEIGHTS)
+            changed |= bool(
+                np.max(np.abs((windows if windows is not None else 1.0) - before)) > SETTLED_WEIGHTS
+            )
         if not (moved or changed):
             return self._without_sensor_errors(state)
         out._weights = GraspWeights(variances, windows, out._weights.time_offset)
@@ -240,10 +257,12 @@ class GraspPose:
 
     def escape(self, state: State) -> State | None:
         """A start in the basin of a better rotation, or None when this one is the global optimum or nothing better is found."""
+        Z_g, Z_a = self.corrected_moments()
         Q = rotation_cost(
             self.model,
             state,
-            *(_projected(Z) for Z in self.corrected_moments()),
+            _projected(Z_g),
+            _projected(Z_a),
             prior_precision(self.model, self.noise, self.prior),
             self.prior,
         )
@@ -253,19 +272,25 @@ class GraspPose:
     def score_covariance(self, state: State) -> FloatArray:
         """Covariance (n, n) of the gradient: sandwich meat of noise-corrected, forgetting and robust weights, and of model error.
 
-        With the uncorrected, squared-weight moments it is what the noise model says. Where stretches of the recording or bands of
-        frequency disagree significantly more, the affected unknowns are widened to that disagreement.
+        With the uncorrected, squared-weight moments it is what the noise model says. Where stretches of the
+        recording or bands of frequency disagree significantly more, the affected unknowns are widened to that
+        disagreement.
         """
         if self.clock.correlation < SMALLEST_CORRELATION:
-            # Robot and hand are not seen to turn together: noise alone shaped this state, and nothing of the grasp is known.
+            # Robot and hand are not seen to turn together: noise alone shaped this state, and nothing of the
+            # grasp is known.
             H = self._information(state)
             known = np.linalg.inv(np.diag(prior_precision(self.model, self.noise, self.prior)))
             return np.asarray(H @ known @ H)
         meat = self._model_meat(state)
-        return meat if not self.settings.check_model else self.check(state).widened(self._information(state), meat)
+        return (
+            meat
+            if not self.settings.check_model
+            else self.check(state).widened(self._information(state), meat)
+        )
 
     def check(self, state: State) -> ModelCheck:
-        """Do separate stretches and frequency bands, and both sides, tell the same story?"""
+        """Test whether stretches, frequency bands and both sides tell the same story."""
         return check_model(
             self.model,
             state,
@@ -294,7 +319,8 @@ class GraspPose:
         """The typed view, with the whole time offset and the data that reports draw."""
         return GraspPoseEstimate.from_estimate(estimate, self)
 
-    # ---- what other parts of the library read ----------------------------------------------------------------
+    # ---- what other parts of the library read
+    # ----------------------------------------------------------------
 
     @property
     def time_offset(self) -> float:
@@ -337,7 +363,9 @@ class GraspPose:
         robot, hand = self._streams
         limits = [gap_limit(stream.t, self.settings.max_gap) for stream in self._streams]
         gaps = [stream.gaps(limit) for stream, limit in zip(self._streams, limits, strict=True)]
-        phi = np.tensordot(self._weights.variances.weights[1], self._moments.accelerometer.sum(axis=0), 1)[:12, :12]
+        phi = np.tensordot(self._weights.variances.weights[1], self._moments.accelerometer.sum(axis=0), 1)[
+            :12, :12
+        ]
         return GraspDiagnostics(
             t=windows.t,
             gyro_residual=np.sqrt(np.sum(e_g**2, axis=(1, 2)) / windowing.dof.sum()),
@@ -354,7 +382,7 @@ class GraspPose:
             samples_used=float(np.mean(used_samples(self._grid, windows))),
             robot_gaps=(gaps[0].count, gaps[0].seconds, int(np.count_nonzero(~robot.valid))),
             hand_gaps=(gaps[1].count, gaps[1].seconds, int(np.count_nonzero(~hand.valid))),
-            excitation=np.linalg.eigvalsh(phi_information(phi)),
+            excitation=np.asarray(np.linalg.eigvalsh(phi_information(phi)), dtype=float),
             rate_moment=self._grid.rate_moment,
             clock_correlation=self.clock.correlation,
             clock_ambiguity=self.clock.ambiguity,
@@ -362,7 +390,8 @@ class GraspPose:
             kinematics_bandwidth=self.kinematics_bandwidth,
         )
 
-    # ---- internals -------------------------------------------------------------------------------------------
+    # ---- internals
+    # -------------------------------------------------------------------------------------------
 
     def _without_sensor_errors(self, state: State) -> GraspPose | None:
         """The same problem less those sensor errors that turned out to be nothing; None when there are none to drop."""
@@ -381,7 +410,10 @@ class GraspPose:
     def _moved(self, before: State, after: State) -> float:
         """Largest change of an unknown in standard deviations."""
         sd = np.sqrt(np.diag(floored_inverse(self._information(after))))
-        steps = [v.local(before[v.name], after[v.name]) / sd[self.model.columns[v.name]] for v in self.model.variables]
+        steps = [
+            v.local(before[v.name], after[v.name]) / sd[self.model.columns[v.name]]
+            for v in self.model.variables
+        ]
         return float(np.max(np.abs(np.concatenate(steps))))
 
     def _blank_state(self) -> dict[str, FloatArray]:
@@ -391,14 +423,17 @@ class GraspPose:
 
     def _search_clock(self, motion: Any) -> ClockSearch:
         guess = self.settings.time_offset_guess
-        # Without a search the correlation at the guess is still wanted: it tells whether the two sides moved together at all.
+        # Without a search the correlation at the guess is still wanted: it tells whether the two sides moved
+        # together at all.
         reach = self.settings.max_time_offset if self.settings.time_offset else 1e-9
         found = search_time_offset(motion, self._hand, guess, reach, self.bandwidth)
         if not self.settings.time_offset or found.correlation < SMALLEST_CORRELATION:
             found = ClockSearch(guess, found.correlation, found.ambiguity)
         robot_speed, hand_speed = _rms(motion.angular_velocity), _rms(self._hand.angular_velocity)
         ratio = hand_speed / robot_speed if robot_speed > 0.0 else 1.0
-        if found.correlation > SMALLEST_CORRELATION and (ratio > MOST_RATE_RATIO or ratio < 1.0 / MOST_RATE_RATIO):
+        if found.correlation > SMALLEST_CORRELATION and (
+            ratio > MOST_RATE_RATIO or ratio < 1.0 / MOST_RATE_RATIO
+        ):
             side = "hand" if ratio > 1.0 else "robot"
             raise InputError(
                 f"{side} angular velocity",
@@ -430,7 +465,13 @@ class GraspPose:
 
     def _compress(self) -> Moments:
         stretch = stretches(self._windows.t.size, STRETCHES)
-        return compress(self._grid.windowing, self._windows.gyro, self._windows.accelerometer, stretch, self._weights.windows)
+        return compress(
+            self._grid.windowing,
+            self._windows.gyro,
+            self._windows.accelerometer,
+            stretch,
+            self._weights.windows,
+        )
 
     def _window_norms(self, state: State, variances: BandVariances) -> FloatArray:
         """Root mean square of the whitened residual of every window (about 1 where the model fits), (windows,)."""
@@ -457,7 +498,9 @@ class GraspPose:
         w_g, w_a = self._weights.variances.weights
         moments = self._moments
         gyro = moments.gyro if moments.gyro_squared is None else moments.gyro_squared
-        accelerometer = moments.accelerometer if moments.accelerometer_squared is None else moments.accelerometer_squared
+        accelerometer = (
+            moments.accelerometer if moments.accelerometer_squared is None else moments.accelerometer_squared
+        )
         L_g, L_a = self.model.matrices(state)
         J_g, J_a = self.model.jacobians(state)
         meat = quadratic_forms(L_g, J_g, np.tensordot(w_g, gyro.sum(axis=0), 1))[2]
@@ -482,7 +525,11 @@ def _checked_gravity(gravity: Sequence[float] | FloatArray) -> FloatArray:
         raise InputError("gravity", "3 finite numbers in m/s^2", str(gravity))
     size = float(np.linalg.norm(out))
     if not 1.0 < size < 30.0:
-        raise InputError("gravity", "a vector of about 9.81 m/s^2 in the robot's world frame", f"{out.tolist()} (norm {size:.3g})")
+        raise InputError(
+            "gravity",
+            "a vector of about 9.81 m/s^2 in the robot's world frame",
+            f"{out.tolist()} (norm {size:.3g})",
+        )
     return out
 
 

@@ -49,11 +49,11 @@ class HandSignals:
             step = (self.t[-1] - self.t[0]) / (self.t.size - 1)
             first, last = (times[0] - self.t[0]) / step, (times[-1] - self.t[0]) / step
             if abs((last - first) - (times.size - 1)) < _DRIFT:
-                return _shifted(self.both, 0.5 * (first + last - (times.size - 1)), times.size)
+                return shifted_rows(self.both, 0.5 * (first + last - (times.size - 1)), times.size)
         return signals.resample_uniform(self.t, self.both, times, max_gap=self.limit, kind="cubic")[1]
 
 
-def _shifted(x: FloatArray, start: float, count: int) -> FloatArray:
+def shifted_rows(x: FloatArray, start: float, count: int) -> FloatArray:
     """Rows ``start, start + 1, ...`` of x (n, c), `start` not whole, by the four-point Lagrange polynomial; NaN where it lacks a row."""
     whole = int(np.floor(start + 1e-9))
     u = start - whole
@@ -101,8 +101,8 @@ class CoupledWindows:
 class CouplingGrid:
     """The robot side on the common grid, ready to be coupled with the hand at any time offset.
 
-    Products are formed at the full rate; then every entry of z is averaged over `averaged` samples, which keeps the relations exact and the
-    windows short.
+    Products are formed at the full rate; then every entry of z is averaged over `averaged` samples, which
+    keeps the relations exact and the windows short.
     """
 
     t: FloatArray
@@ -132,6 +132,11 @@ class CouplingGrid:
         accelerometer = np.concatenate(parts, axis=3)
         centres = self.t[0] + self.windowing.centres(good.size)
         return CoupledWindows(gyro, accelerometer, centres[good], int(np.count_nonzero(~good)))
+
+
+def averaged_samples(step: float, bandwidth: float) -> int:
+    """How many samples of a grid with this step (s) one entry of z averages, for relations used up to `bandwidth` (Hz)."""
+    return max(1, int(1.0 / (step * _RATE_OVER_BANDWIDTH * bandwidth) + 1e-6))
 
 
 def average(x: FloatArray, samples: int) -> FloatArray:
@@ -183,17 +188,20 @@ def coupling_grid(
     z = np.hstack([robot.angular_velocity, *parts])
     t = robot.t
     if hand_rate > 1.05 / robot.step:
-        # The hand is sampled faster: its extra samples carry information, so the smooth robot side goes onto a finer grid.
+        # The hand is sampled faster: its extra samples carry information, so the smooth robot side goes onto
+        # a finer grid.
         t = robot.t[0] + np.arange(int((robot.t[-1] - robot.t[0]) * hand_rate) + 1) / hand_rate
         z = signals.resample_uniform(robot.t, z, t, max_gap=1.6 * robot.step, kind="cubic")[1]
     step = float((t[-1] - t[0]) / (t.size - 1))
-    averaged = max(1, int(1.0 / (step * _RATE_OVER_BANDWIDTH * bandwidth)))
+    averaged = averaged_samples(step, bandwidth)
     z, fine = average(z, averaged), t
     t = average(t[:, None], averaged)[:, 0]
     windowing = Windowing.for_grid(averaged * step, window, bandwidth, t.size)
     rows = z[np.isfinite(z).all(axis=1)]
     if rows.shape[0] == 0:
-        raise InputError("robot", "at least one stretch without gaps", "none: every differentiation window touches a gap")
+        raise InputError(
+            "robot", "at least one stretch without gaps", "none: every differentiation window touches a gap"
+        )
     return CouplingGrid(
         t=t,
         fine=fine,
@@ -230,8 +238,9 @@ def search_time_offset(
 ) -> ClockSearch:
     """Coarse offset from the rotation-invariant correlation of the two angular rates.
 
-    For every lag the best rotation between the rates is Wahba's; what it explains is the sum of the singular values of their
-    cross-correlation (the least of them signed by the determinant). Unlike the correlation of the norms, this sees coning, whose norm is constant.
+    For every lag the best rotation between the rates is Wahba's; what it explains is the sum of the singular
+    values of their cross-correlation (the least of them signed by the determinant). Unlike the correlation of
+    the norms, this sees coning, whose norm is constant.
 
     Raises
     ------
@@ -242,11 +251,15 @@ def search_time_offset(
     grid = np.arange(robot.t[0], robot.t[-1], step)
     if grid.size < 16:
         raise InputError("robot", "a recording of at least 16 samples", f"{grid.size}")
-    x = signals.resample_uniform(robot.t, robot.angular_velocity, grid, max_gap=max(1.6 * robot.step, 1.1 * step))[1]
+    x = signals.resample_uniform(
+        robot.t, robot.angular_velocity, grid, max_gap=max(1.6 * robot.step, 1.1 * step)
+    )[1]
     hand_grid = np.arange(grid[0] + guess - reach, grid[-1] + guess + reach + step, step)
-    y = signals.resample_uniform(hand.t, hand.angular_velocity, hand_grid, max_gap=max(hand.limit, 1.1 * step))[1]
+    y = signals.resample_uniform(
+        hand.t, hand.angular_velocity, hand_grid, max_gap=max(hand.limit, 1.1 * step)
+    )[1]
     correlations = _rotation_invariant_correlation(x, y)
-    lags = guess - reach + step * np.arange(correlations.size)
+    lags: FloatArray = guess - reach + step * np.arange(correlations.size, dtype=np.float64)
     if correlations.size == 0 or not np.any(np.isfinite(y)):
         raise InputError(
             "robot and hand",
@@ -257,20 +270,25 @@ def search_time_offset(
     if not np.isfinite(correlations).any():
         # One side does not rotate at all: no offset can be found, and none matters.
         return ClockSearch(guess, 0.0, 1.0)
-    found = _best_peak(lags, np.where(np.isfinite(correlations), correlations, -1.0), guess, step)
+    found = _best_peak(lags, np.nan_to_num(correlations, nan=-1.0), guess, step)
     if reach < step or found.correlation < SMALLEST_CORRELATION:
         return found
     return _sharpened(found, grid, x, hand, step)
 
 
-def _sharpened(found: ClockSearch, grid: FloatArray, x: FloatArray, hand: HandSignals, step: float) -> ClockSearch:
-    """One Gauss-Newton step on the offset with the best rotation and bias held: the parabola through the peak is a few tenths of a step off."""
+def _sharpened(
+    found: ClockSearch, grid: FloatArray, x: FloatArray, hand: HandSignals, step: float
+) -> ClockSearch:
+    """One Gauss-Newton step on the offset with rotation and bias held.
+
+    The parabola through the correlation's peak is a few tenths of a step off.
+    """
     y = signals.resample_uniform(
         hand.t, hand.angular_velocity, grid + found.offset, max_gap=max(hand.limit, 1.1 * step), kind="cubic"
     )[1]
     slope = np.full_like(y, np.nan)
     slope[1:-1] = (y[2:] - y[:-2]) / (2.0 * step)
-    good = np.isfinite(x).all(axis=1) & np.isfinite(slope).all(axis=1) & np.isfinite(y).all(axis=1)
+    good: BoolArray = np.asarray(np.isfinite(np.hstack([x, slope, y])).all(axis=1))
     if np.count_nonzero(good) < 16:
         return found
     a, b, d = (part[good] - part[good].mean(axis=0) for part in (x, y, slope))
@@ -343,6 +361,7 @@ __all__ = [
     "HandSignals",
     "coupling_grid",
     "search_time_offset",
+    "shifted_rows",
     "tilt_axes",
     "used_samples",
     "vech_products",

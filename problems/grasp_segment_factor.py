@@ -116,7 +116,7 @@ class SegmentFactor:
         moments, model = self.moments, self.model
         gain = None
         if self._slip_rate_variance > 0.0:
-            _, state, gain = self._slipping(state)
+            _, state, gain, _ = self._slipping(state)
         (L_g, L_a), (J_g, J_a) = model.matrices(state), model.jacobians(state)
         if gain is not None:
             J_g = np.concatenate([J_g, _slip_jacobian(model, state)])
@@ -127,8 +127,45 @@ class SegmentFactor:
             meat = lift @ meat @ lift.T
         return np.asarray(meat + quadratic_forms(L_a, J_a, moments.accelerometer_score)[2])
 
-    def _slipping(self, state: State) -> tuple[Quadratic, State, FloatArray]:
-        """The cost at its best slip rate, the state with that rate in the gyroscope's bias, and ``H_xn H_nn^-1`` (n, 3)."""
+    def band_powers(
+        self, state: State, covariance: FloatArray, gyro: FloatArray, accelerometer: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Residual power of every band, and ``tr(C J Z J')`` that the fit took from it, both sensors: (2, bands) each.
+
+        Parameters
+        ----------
+        covariance : (n, n) ndarray
+            Of the unknowns that the segment sees.
+        gyro, accelerometer : (bands, 10, 10) and (bands, m, m) ndarray
+            Moments of the segment, not weighted.
+        """
+        model = self.model
+        lift = np.eye(model.size)
+        spread = covariance
+        if self._slip_rate_variance > 0.0:
+            _, state, gain, own = self._slipping(state)
+            lift = np.vstack([lift, -gain.T])
+            spread = lift @ covariance @ lift.T
+            spread[-3:, -3:] += own
+        (L_g, L_a), (J_g, J_a) = model.matrices(state), model.jacobians(state)
+        if lift.shape[0] > model.size:
+            J_g = np.concatenate([J_g, _slip_jacobian(model, state)])
+        powers, spreads = [], []
+        for L, J, C, Z in ((L_g, J_g, spread, gyro), (L_a, J_a, covariance, accelerometer)):
+            powers.append(np.einsum("ij,kjl,il->k", L, Z, L, optimize=True))
+            spreads.append(np.einsum("ab,aij,kjl,bil->k", C, J, Z, J, optimize=True))
+        return np.stack(powers), np.stack(spreads)
+
+    def slip_rate_evidence(self, state: State) -> float:
+        """``log det (I + variance H)`` of the slip rate that was eliminated."""
+        if self._slip_rate_variance == 0.0:
+            return 0.0
+        L_g, _ = self.model.matrices(state)
+        matrix = quadratic_forms(L_g, _slip_jacobian(self.model, state), self.moments.gyro)[2]
+        return float(np.linalg.slogdet(np.eye(3) + self._slip_rate_variance * matrix)[1])
+
+    def _slipping(self, state: State) -> tuple[Quadratic, State, FloatArray, FloatArray]:
+        """The cost at its best slip rate, the state with that rate in the gyroscope's bias, ``H_xs H_ss^-1`` (n, 3) and ``H_ss^-1``."""
         moments, model = self.moments, self.model
         precision = np.eye(3) / self._slip_rate_variance
         L_g, _ = model.matrices(state)
@@ -141,9 +178,10 @@ class SegmentFactor:
         c_g, g_g, H_g = quadratic_forms(L_g, J_g, moments.gyro)
         c_a, g_a, H_a = quadratic_forms(L_a, J_a, moments.accelerometer)
         n = model.size
-        gain = np.linalg.solve(H_g[n:, n:] + precision, H_g[n:, :n]).T
+        own = np.linalg.inv(H_g[n:, n:] + precision)
+        gain = H_g[:n, n:] @ own
         value = c_g + c_a + 0.5 * float(rate @ precision @ rate)
-        return Quadratic(value, g_g[:n] + g_a, H_g[:n, :n] - gain @ H_g[n:, :n] + H_a), state, gain
+        return Quadratic(value, g_g[:n] + g_a, H_g[:n, :n] - gain @ H_g[n:, :n] + H_a), state, gain, own
 
     # ---- gtsam -----------------------------------------------------------------------------------------------
 

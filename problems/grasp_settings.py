@@ -16,8 +16,9 @@ from factorgrasp.typing import FloatArray
 class GraspNoise:
     """Noise of both sides; the defaults fit a consumer IMU on the hand and an industrial robot or a motion-capture system.
 
-    A *density* ``d`` stands for white noise whose variance a sample is ``d^2 * rate``. An *sd* of a pose is that of one sample. The densities
-    are starting values: with ``GraspSettings.adapt_noise`` the residual power of every frequency band is estimated from the data.
+    A *density* ``d`` stands for white noise whose variance a sample is ``d^2 * rate``. An *sd* of a pose is
+    that of one sample. The densities are starting values: with ``GraspSettings.adapt_noise`` the residual
+    power of every frequency band is estimated from the data.
 
     Attributes
     ----------
@@ -28,16 +29,19 @@ class GraspNoise:
     gyro_bias_sd, accelerometer_bias_sd : float
         Prior of the constant biases, rad/s and m/s^2.
     gyro_scale_sd, accelerometer_scale_sd : float
-        Prior of scale and misalignment errors of the hand IMU's axes, as a fraction; see ``GraspSettings.sensor_errors``.
+        Prior of scale and misalignment errors of the hand IMU's axes, as a fraction; see
+        ``GraspSettings.sensor_errors``.
     accelerometer_delay_sd : float
-        Prior of the delay between the accelerometer's and the gyroscope's channels (their built-in filters differ), s.
+        Prior of the delay between the accelerometer's and the gyroscope's channels (their built-in filters
+        differ), s.
     robot_position_sd, robot_rotation_sd : float or None
         Of one robot pose, m and rad; None estimates them from the pose stream's own high frequencies.
     robot_joint_sd : float
         Of one joint position, rad, when the robot side is a joint stream.
     robot_angular_velocity_density, robot_angular_acceleration_density, robot_acceleration_density : float or None
-        rad/s, rad/s^2 and m/s^2 per sqrt(Hz), when the robot side is a motion stream; None estimates them from the stream's own high frequencies.
-        For an IMU on the robot the first and the last; None takes the hand's densities.
+        rad/s, rad/s^2 and m/s^2 per sqrt(Hz), when the robot side is a motion stream; None estimates them
+        from the stream's own high frequencies. For an IMU on the robot the first and the last; None takes the
+        hand's densities.
     base_tilt_sd : float
         Prior of the tilt of the robot's base against gravity, rad, when it is estimated.
     time_offset_sd : float
@@ -65,12 +69,27 @@ class GraspNoise:
             value = getattr(self, item.name)
             if value is None and item.default is None:
                 continue
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value) or value < 0.0:
+            if (
+                isinstance(value, bool)
+                or not isinstance(value, (int, float))
+                or not np.isfinite(value)
+                or value < 0.0
+            ):
                 raise InputError(f"noise.{item.name}", "a finite number, zero or more", repr(value))
-        for name in ("gyro_density", "accelerometer_density", "gyro_bias_sd", "accelerometer_bias_sd", "time_offset_sd", "base_tilt_sd"):
+        for name in (
+            "gyro_density",
+            "accelerometer_density",
+            "gyro_bias_sd",
+            "accelerometer_bias_sd",
+            "time_offset_sd",
+            "base_tilt_sd",
+        ):
             if getattr(self, name) == 0.0:
                 raise InputError(
-                    f"noise.{name}", "a number above zero (a singular covariance has no least squares)", "0", _ZERO_HINTS.get(name, "")
+                    f"noise.{name}",
+                    "a number above zero (a singular covariance has no least squares)",
+                    "0",
+                    _ZERO_HINTS.get(name, ""),
                 )
 
 
@@ -111,7 +130,8 @@ class GraspSettings:
     bandwidth : float or None
         Hz; the relations are used up to this frequency. None: 20 Hz, or a fifth of the slower rate.
     kinematics_bandwidth : float or None
-        Hz; of the differentiation of robot poses or joints. None: twice `bandwidth`, as far as the rate allows.
+        Hz; of the differentiation of robot poses or joints. None: twice `bandwidth`, as far as the rate
+        allows.
     window : float
         s; length of the analysis windows.
     max_gap : float or None
@@ -119,10 +139,12 @@ class GraspSettings:
     rotation_resolution, translation_resolution : float
         rad and m; a direction whose posterior sd is larger counts as not identified.
     sensor_errors : {"auto", "always", "never"}
-        Estimate scale and misalignment errors of the hand IMU and the delay between its two channels. "auto" does so first and drops
-        those groups that the data do not show to differ from zero, so that a well-calibrated sensor costs no accuracy.
+        Estimate scale and misalignment errors of the hand IMU and the delay between its two channels. "auto"
+        does so first and drops those groups that the data do not show to differ from zero, so that a
+        well-calibrated sensor costs no accuracy.
     check_model : bool
-        Widen the covariance where the scores of separate stretches of the recording scatter more than the noise allows.
+        Widen the covariance where the scores of separate stretches of the recording scatter more than the
+        noise allows.
     """
 
     time_offset: bool = True
@@ -156,7 +178,9 @@ class GraspSettings:
         for name in ("window", "rotation_resolution", "translation_resolution", "max_time_offset"):
             _above_zero(f"estimate.{name}", getattr(self, name))
         if not np.isfinite(self.time_offset_guess):
-            raise InputError("estimate.time_offset_guess", "a finite number of seconds", repr(self.time_offset_guess))
+            raise InputError(
+                "estimate.time_offset_guess", "a finite number of seconds", repr(self.time_offset_guess)
+            )
 
 
 @dataclass(frozen=True)
@@ -168,7 +192,8 @@ class GraspPrior:
     translation : (3,) ndarray
         ``p_r_h``, m.
     translation_sd : float
-        m, of every component. The default says only that a hand is within a few metres of the robot's end-effector.
+        m, of every component. The default says only that a hand is within a few metres of the robot's
+        end-effector.
     rotation : (3, 3) ndarray or None
         ``R_r_h``.
     rotation_sd : float or None
@@ -190,12 +215,21 @@ class GraspPrior:
             raise InputError("prior.rotation", "rotation and rotation_sd together", "only one of them")
         if self.rotation is not None:
             rotation = np.asarray(self.rotation, dtype=float)
-            if rotation.shape != (3, 3) or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) or np.linalg.det(rotation) < 0:
+            if (
+                rotation.shape != (3, 3)
+                or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)
+                or np.linalg.det(rotation) < 0
+            ):
                 raise InputError("prior.rotation", "a rotation matrix (3, 3)", str(rotation.tolist()))
             object.__setattr__(self, "rotation", rotation)
             _above_zero("prior.rotation_sd", self.rotation_sd)
 
 
 def _above_zero(field: str, value: object) -> None:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value) or value <= 0.0:
+    if (
+        isinstance(value, bool)
+        or not isinstance(value, (int, float))
+        or not np.isfinite(value)
+        or value <= 0.0
+    ):
         raise InputError(field, "a finite number above zero", repr(value))

@@ -24,17 +24,31 @@ def grasp_variables(
     axes = ("x", "y", "z")
     every = {
         "rotation": Variable(
-            "rotation", 3, "rotation", "rad", tuple(f"rotation about hand {a}" for a in axes), settings.rotation_resolution
+            "rotation",
+            3,
+            "rotation",
+            "rad",
+            tuple(f"rotation about hand {a}" for a in axes),
+            settings.rotation_resolution,
         ),
         "translation": Variable(
-            "translation", 3, "vector", "m", tuple(f"lever arm {a}" for a in axes), settings.translation_resolution
+            "translation",
+            3,
+            "vector",
+            "m",
+            tuple(f"lever arm {a}" for a in axes),
+            settings.translation_resolution,
         ),
-        "gyro_bias": Variable("gyro_bias", 3, unit="rad/s", components=tuple(f"gyroscope bias {a}" for a in axes)),
+        "gyro_bias": Variable(
+            "gyro_bias", 3, unit="rad/s", components=tuple(f"gyroscope bias {a}" for a in axes)
+        ),
         "accelerometer_bias": Variable(
             "accelerometer_bias", 3, unit="m/s^2", components=tuple(f"accelerometer bias {a}" for a in axes)
         ),
         "time_offset": Variable("time_offset", 1, unit="s", components=("time offset",)),
-        "accelerometer_delay": Variable("accelerometer_delay", 1, unit="s", components=("accelerometer delay",)),
+        "accelerometer_delay": Variable(
+            "accelerometer_delay", 1, unit="s", components=("accelerometer delay",)
+        ),
         "base_tilt": Variable("base_tilt", 2, unit="rad", components=("base tilt 1", "base tilt 2")),
         "gyro_calibration": Variable("gyro_calibration", 6, unit=""),
         "accelerometer_calibration": Variable("accelerometer_calibration", 9, unit=""),
@@ -83,7 +97,9 @@ def prior_precision(model: GraspModel, noise: GraspNoise, prior: GraspPrior) -> 
 def prior_residual(variable: Variable, state: State, prior: GraspPrior) -> tuple[FloatArray, FloatArray]:
     """Jacobian (size, size) and residual (size,) of a variable against its prior mean (zero but for the grasp itself)."""
     if variable.name == "rotation":
-        error = lie.so3_log(state["rotation"] if prior.rotation is None else prior.rotation.T @ state["rotation"])
+        error = lie.so3_log(
+            state["rotation"] if prior.rotation is None else prior.rotation.T @ state["rotation"]
+        )
         return lie.so3_right_jacobian_inverse(error), error
     mean = prior.translation if variable.name == "translation" else 0.0
     return np.eye(variable.size), state[variable.name] - mean
@@ -113,14 +129,17 @@ def least_squares_pattern(model: GraspModel, precision: FloatArray) -> LeastSqua
     ]
     for variable in model.variables:
         covariance = Covariance.diagonal(1.0 / precision[model.columns[variable.name]])
-        terms.append(Term(f"prior of {variable.name}", variable.size, (variable.name,), covariance, unit=variable.unit))
+        terms.append(
+            Term(f"prior of {variable.name}", variable.size, (variable.name,), covariance, unit=variable.unit)
+        )
     return LeastSquares(model.variables, terms)
 
 
 def positive_part(Z: FloatArray) -> FloatArray:
     """Root S (m, m) with ``S S'`` the nearest positive semidefinite matrix to Z.
 
-    Taking the expected noise out can leave small negative eigenvalues where nothing excites; they carry no information.
+    Taking the expected noise out can leave small negative eigenvalues where nothing excites; they carry no
+    information.
     """
     diagonal = np.diag(Z)
     scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))

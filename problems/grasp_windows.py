@@ -1,16 +1,19 @@
 """Short-time spectra of the moments' inputs, and the second moments that they compress to.
 
-The relations of :mod:`factorgrasp.problems.grasp_model` are linear in z, so the same linear functional on every entry of z keeps them exact (mathematics
-2.3). Here the functionals are sine-windowed cosines and sines on half-overlapping windows. They form a tight frame: their squares sum to
-the signal's energy. That buys three things over one low-pass filter: the residual's noise is nearly white inside a narrow band, so every
-band gets the weight that its own residual power deserves; coefficients of a band count as independent, so the covariance is
-honest for coloured noise (differentiated poses) as for white; and a window that touches a gap is left out whole, so nothing is bridged.
+The relations of :mod:`factorgrasp.problems.grasp_model` are linear in z, so the same linear functional on
+every entry of z keeps them exact (mathematics 2.3). Here the functionals are sine-windowed cosines and sines
+on half-overlapping windows. They form a tight frame: their squares sum to the signal's energy. That buys
+three things over one low-pass filter: the residual's noise is nearly white inside a narrow band, so every
+band gets the weight that its own residual power deserves; coefficients of a band count as independent, so the
+covariance is honest for coloured noise (differentiated poses) as for white; and a window that touches a gap
+is left out whole, so nothing is bridged.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
 
@@ -66,6 +69,10 @@ class Windowing:
         out[0] = 0.5
         return out
 
+    def basis(self) -> FloatArray:
+        """Windowed cosines and sines (2 bins, length): a window's coefficients are ``basis @ z``."""
+        return np.hstack(_basis(self.length, self.bins))
+
     def transform(self, z: FloatArray) -> FloatArray:
         """Coefficients (windows, bins, 2, c) of signals z (n, c); NaN in every window that touches a NaN."""
         half = self.length // 2
@@ -114,14 +121,14 @@ class Moments:
 
     def scaled(self, factor: float) -> Moments:
         """All window weights multiplied by `factor`."""
-        squared = self.gyro_squared is not None and self.accelerometer_squared is not None
-        return replace(
-            self,
+        gyro = self.gyro if self.gyro_squared is None else self.gyro_squared
+        force = self.accelerometer if self.accelerometer_squared is None else self.accelerometer_squared
+        return Moments(
             gyro=factor * self.gyro,
             accelerometer=factor * self.accelerometer,
             dof=factor * self.dof,
-            gyro_squared=factor**2 * (self.gyro_squared if squared else self.gyro),  # type: ignore[operator]
-            accelerometer_squared=factor**2 * (self.accelerometer_squared if squared else self.accelerometer),  # type: ignore[operator]
+            gyro_squared=factor**2 * gyro,
+            accelerometer_squared=factor**2 * force,
         )
 
 
@@ -151,7 +158,7 @@ def compress(
     edges = np.searchsorted(stretch, np.arange(count + 1))
     unit = weights is None or bool(np.all(weights == 1.0))
     weight = np.ones(stretch.size) if weights is None else weights
-    dof = np.stack([weight[a:b].sum() * windowing.dof for a, b in zip(edges[:-1], edges[1:], strict=True)])
+    dof = np.stack([weight[a:b].sum() * windowing.dof for a, b in pairwise(edges)])
     return Moments(
         gyro=_second_moments(gyro, edges, None if unit else weight),
         accelerometer=_second_moments(accelerometer, edges, None if unit else weight),
@@ -164,7 +171,7 @@ def compress(
 def _second_moments(coefficients: FloatArray, edges: IntArray, weights: FloatArray | None) -> FloatArray:
     bins, width = coefficients.shape[1], coefficients.shape[3]
     out = np.zeros((edges.size - 1, bins, width, width))
-    for b, (start, stop) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+    for b, (start, stop) in enumerate(pairwise(edges)):
         part = coefficients[start:stop].transpose(1, 0, 2, 3)
         flat = part.reshape(bins, -1, width)
         other = flat if weights is None else flat * np.repeat(weights[start:stop], 2)[None, :, None]

@@ -67,7 +67,7 @@ def unrelated(correlation: float, rate_moment: FloatArray) -> str:
     if speed < 0.05:
         return f"The end-effector hardly rotates ({np.degrees(speed):.2g} deg/s rms), so nothing ties the hand's motion to it."
     return (
-        f"Robot and hand do not turn together (correlation of their angular rates {correlation:.2f} at the best offset): the recordings may not "
-        "belong to the same motion, the clocks may differ by more than max_time_offset, or the quaternions may be in another order or direction "
-        "than w, x, y, z body-to-world."
+        f"Robot and hand do not turn together (correlation of their angular rates {correlation:.2f} at the "
+        "best offset): the recordings may not belong to the same motion, the clocks may differ by more than "
+        "max_time_offset, or the quaternions may be in another order or direction than w, x, y, z body-to-world."
     )

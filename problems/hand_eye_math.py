@@ -444,11 +444,14 @@ def match_clocks(coupling: PoseCoupling, guess: float, reach: float) -> ClockMat
     return ClockMatch(float(fine[best]), float(np.clip(values[best], 0.0, 1.0)))
 
 
-def start_state(coupling: PoseCoupling, samples: IntArray, offset: float) -> dict[str, FloatArray]:
+def start_state(
+    coupling: PoseCoupling, samples: IntArray, offset: float, lever: FloatArray
+) -> dict[str, FloatArray]:
     """Rotations in closed form, then translations by linear least squares.
 
     The grasp's rotation is Wahba's on pairs of relative rotations. Where these share one axis (or there are none) it is only known up
-    to a turn about that axis: several turns, and the rotation that the displacements suggest, then compete.
+    to a turn about that axis: several turns, and the rotation that the displacements suggest, then compete. `lever` (3,) is the lever
+    arm where nothing shows it.
     """
     pairs = _pairs(coupling.sampled)
     turn, _, inside = _other_side(coupling, pairs, offset)
@@ -465,20 +468,32 @@ def start_state(coupling: PoseCoupling, samples: IntArray, offset: float) -> dic
         candidates += list(best @ lie.so3_exp(angles[:, None] * Vt[0]))
         world = lie.project_to_so3((a - a.mean(axis=0)).T @ (b - b.mean(axis=0)))
         candidates.append(lie.project_to_so3((transposed(A) @ world @ B).sum(axis=0)))
-    found = [_completed(X, A, a, B, b) for X in candidates]
+    noise = float(coupling.robot.noise[0, 0])
+    found = [_completed(X, A, a, B, b, noise, lever) for X in candidates]
     state = min(found, key=lambda item: item[0])[1]
     state["time_offset"] = np.array([offset])
     return state
 
 
 def _completed(
-    X: FloatArray, A: FloatArray, a: FloatArray, B: FloatArray, b: FloatArray
+    X: FloatArray,
+    A: FloatArray,
+    a: FloatArray,
+    B: FloatArray,
+    b: FloatArray,
+    turn_noise: float,
+    lever: FloatArray,
 ) -> tuple[float, dict[str, FloatArray]]:
     """World rotation (mean) and translations (least squares) that go with a grasp rotation, and a robust measure of the misfit."""
     Y = lie.project_to_so3((A @ X @ transposed(B)).sum(axis=0))
-    rows = np.concatenate([A, np.broadcast_to(-np.eye(3), A.shape)], axis=2).reshape(-1, 6)
-    solution = np.linalg.lstsq(rows, (b @ Y.T - a).ravel(), rcond=1e-6)[0]
-    p, q = solution[:3], solution[3:]
+    target = b @ Y.T - a
+    mean_A, mean_target = A.mean(axis=0), target.mean(axis=0)
+    spread, axes = np.linalg.eigh(np.eye(3) - mean_A.T @ mean_A)
+    cross = apply(transposed(A), target).mean(axis=0) - mean_A.T @ mean_target
+    # An orientation that only noise changes says nothing of the lever arm along that axis.
+    seen = spread > 6.0 * turn_noise**2 + 1e-9
+    p = axes @ np.where(seen, (axes.T @ cross) / np.where(seen, spread, 1.0), axes.T @ lever)
+    q = mean_A @ p - mean_target
     angle = lie.angle_between(A @ X, Y @ B)
     distance = np.linalg.norm(A @ p + a - b @ Y.T - q, axis=1)
     # 1 deg of misfit counts as much as 1 cm of it.

@@ -9,14 +9,21 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from factorgrasp.errors import InputError
 from factorgrasp.problems.link_motion_check import check_masses, check_names, check_rotations, check_tree
-from factorgrasp.problems.link_motion_spatial import motion_transform, rotate, rotate_back, spatial_inertia
+from factorgrasp.problems.link_motion_spatial import (
+    cross_motion,
+    motion_transform,
+    rotate,
+    rotate_back,
+    skew,
+    spatial_inertia,
+)
 from factorgrasp.typing import BoolArray, FloatArray, IntArray
 
 GRAVITY = (0.0, 0.0, -9.80665)
@@ -59,6 +66,45 @@ class LinkJoint:
     def size(self) -> int:
         """Number of degrees of freedom whose axes are known."""
         return len(self.dofs)
+
+
+class LinkKinematics(NamedTuple):
+    """What the equations of motion need of n frames, in the links' own frames; spatial vectors are ``[linear; angular]``.
+
+    Attributes
+    ----------
+    R, p : ndarray
+        (n, L, 3, 3) ``R_w_l`` and (n, L, 3) origin in the world.
+    velocity : ndarray
+        (n, L, 6) ``v_i``.
+    acceleration : ndarray
+        (n, L, 6) ``alpha_i``, proper (minus gravity).
+    transform : ndarray
+        (n, J, 6, 6) ``X`` from the parent's to the child's frame.
+    bias : ndarray
+        (n, J, 6) ``c_j``.
+    subspaces : tuple of ndarray or None
+        ``S_j``, (1 or n, 6, n_j).
+    joint_acceleration : ndarray
+        (n, dofs).
+    joint_centre : ndarray
+        (n, J, 3) in the world.
+    """
+
+    R: FloatArray
+    p: FloatArray
+    velocity: FloatArray
+    acceleration: FloatArray
+    transform: FloatArray
+    bias: FloatArray
+    subspaces: tuple[FloatArray | None, ...]
+    joint_acceleration: FloatArray
+    joint_centre: FloatArray
+
+    @property
+    def count(self) -> int:
+        """Number of frames."""
+        return int(self.R.shape[0])
 
 
 @dataclass(frozen=True)
@@ -233,8 +279,8 @@ class LinkMotion:
     def qdd(self) -> FloatArray:
         """(n, dofs) joint accelerations: those given, else the ones that fit the accelerations of the links best.
 
-        The fit leaves ``Sdot qd + v x S qd`` out, so that it is exact for joints whose bias vanishes only; give `joint_acceleration` where it
-        matters, as :meth:`factorgrasp.problems.link_motion_pinocchio.from_pinocchio` does.
+        The fit takes the bias to be ``v x S qd``: exact for axes that are fixed in the child. Whatever it is, :attr:`joint_bias` belongs to it,
+        so that the links' accelerations are met all the same.
         """
         if self.joint_acceleration is not None:
             return self.joint_acceleration
@@ -264,12 +310,19 @@ class LinkMotion:
 
     @cached_property
     def _constant_axes_bias(self) -> FloatArray:
-        from factorgrasp.problems.link_motion_spatial import cross_motion
-
         v = self.spatial_velocity
         v_child = v[:, self.children]
         v_joint = v_child - (self.joint_transform @ v[:, self.parents, :, None])[..., 0]
         return cross_motion(v_child, v_joint)
+
+    def kinematics(self, frames: slice = slice(None)) -> LinkKinematics:
+        """All of it for some of the frames."""
+        return LinkKinematics(
+            self.R[frames], self.p[frames], self.spatial_velocity[frames], self.proper_acceleration[frames],
+            self.joint_transform[frames], self.joint_bias[frames],
+            tuple(S if S is None or S.shape[0] == 1 else S[frames] for S in self.subspaces),
+            self.qdd[frames], self.joint_centre[frames],
+        )  # fmt: skip
 
     # ---- the whole body ---------------------------------------------------------------------------------------
 
@@ -326,7 +379,5 @@ class LinkMotion:
 
 def spherical_subspace(motion_R: FloatArray, p: FloatArray, centre: FloatArray, child: int) -> FloatArray:
     """``S`` (n, 6, 3) of a ball joint at `centre` (n, 3) with the child's own axes: ``[S(r); 1]``, r the centre in the child's frame."""
-    from factorgrasp.problems.link_motion_spatial import skew
-
     r = rotate_back(motion_R[:, child], centre - p[:, child])
     return np.concatenate([skew(r), np.broadcast_to(np.eye(3), (*r.shape, 3))], axis=-2)

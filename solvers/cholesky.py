@@ -84,7 +84,10 @@ class Cholesky(Solver):
 def linear_values(problem: LeastSquares, row_weights: FloatArray | None = None) -> LinearValues:
     """Current values of a problem with its equalities, whitened."""
     entries, rhs = problem.whitened_values(row_weights)
-    return LinearValues(entries, rhs, problem.equalities.matrix, problem.equalities.rhs)
+    hard = problem.equalities
+    if not hard.height:
+        return LinearValues(entries, rhs, hard.matrix, hard.rhs)
+    return LinearValues(entries, rhs, hard.matrix.copy(), hard.rhs.copy())
 
 
 def rows_words(problem: LeastSquares, rows: IntArray) -> list[str]:

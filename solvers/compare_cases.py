@@ -259,7 +259,9 @@ class NonlinearCase(Case):
         assert other.state is not None
         variables = reference.problem.linearize(reference.state).variables
         steps = [
-            v.local(reference.state[v.name], other.state[v.name]) if v.name in other.state else np.full(v.size, np.nan)
+            v.local(reference.state[v.name], other.state[v.name])
+            if v.name in other.state
+            else np.full(v.size, np.nan)
             for v in variables
         ]
         return np.concatenate(steps)

@@ -156,6 +156,9 @@ class DenseSystem:
         root = self._reduced.root()
         return np.asarray(np.sum((root if self._basis is None else self._basis @ root) ** 2, axis=1))
 
+    def prepare_blocks(self) -> None:
+        """Nothing to prepare: solving is cheap here."""
+
     def block(self, indices: IntArray) -> FloatArray | None:
         """Block of P at `indices`; None where solving for it is no dearer (always, here)."""
         return None

@@ -7,7 +7,7 @@ that of the estimate while the active set stays what it is.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
@@ -85,7 +85,7 @@ class Factor:
     """
 
     def __init__(self, system: LinearSystem, values: LinearValues) -> None:
-        self._values = replace(values, hard=values.hard.copy(), hard_rhs=values.hard_rhs.copy())
+        self._values = values
         self._linear = system
         self._stamp = system.stamp
         self.size = system.size
@@ -120,6 +120,10 @@ class Factor:
         if block is None:
             block = system.apply(_unit_columns(self.size, indices))[indices]
         return np.asarray(0.5 * (block + block.T))
+
+    def prepare_marginals(self) -> None:
+        """Make many calls of `marginal` cheap: one selected inverse holds the covariances of all unknowns that share a row."""
+        self._system().prepare_blocks()
 
     def variances(self) -> FloatArray:
         """Variances of all unknowns (n,) at once, by the selected inverse; infinite where nothing informs them."""
@@ -175,7 +179,7 @@ def posterior_factor(
 def _hard_rows(problem: LeastSquares, active: ActiveSet) -> tuple[sp.csr_array, FloatArray]:
     equalities = problem.equalities
     if active.empty:
-        return equalities.matrix, equalities.rhs
+        return equalities.matrix.copy(), equalities.rhs.copy()
     bound = np.flatnonzero(active.lower | active.upper)
     unit = sp.csr_array(
         (np.ones(bound.size), (np.arange(bound.size), bound)), shape=(bound.size, problem.size)

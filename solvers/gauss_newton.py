@@ -23,7 +23,6 @@ from factorgrasp.solvers.outer_loop import (
     LoopOptions,
     LoopResult,
     cannot_improve,
-    sd_length,
     smallest_step,
     unsettled_words,
 )
@@ -92,7 +91,7 @@ class GaussNewton:
                 return end(found.status, found.message)
             solution = found
             penalty = max(penalty, 1.5 * _largest_multiplier(found))
-            step = sd_length(system, found.x, point.weights)
+            step = float(np.linalg.norm(point.weighted @ found.x))
             slope = -float(point.weighted_rhs @ (point.weighted @ found.x)) - penalty * point.violation
             small = step <= smallest_step(options, point.objective) and damping <= NO_DAMPING
             if small and point.worst_violation <= FEASIBLE:

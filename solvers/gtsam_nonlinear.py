@@ -1,10 +1,12 @@
 """gtsam's own optimisers: Gauss-Newton, Levenberg-Marquardt and iSAM2 on a whole nonlinear problem.
 
-They end by one criterion: the Newton decrement ``1/2 g' H^-1 g`` of the undamped, re-weighted normal equations is at most ``tolerance^2``
-(or at the rounding of the objective), which is an error of about `tolerance` standard deviations in any direction.
+They end by one criterion: the Newton decrement ``1/2 g' H^-1 g`` of the undamped, re-weighted normal
+equations is at most ``tolerance^2`` (or at the rounding of the objective), which is an error of about
+`tolerance` standard deviations in any direction.
 
-Robust losses act as gtsam noise models, which gives the same iteratively re-weighted normal equations as ours. They are not folded into the
-residuals of a custom factor: with weights hidden there Levenberg-Marquardt judges its steps by the wrong objective and can diverge.
+Robust losses act as gtsam noise models, which gives the same iteratively re-weighted normal equations as
+ours. They are not folded into the residuals of a custom factor: with weights hidden there Levenberg-Marquardt
+judges its steps by the wrong objective and can diverge.
 """
 
 from __future__ import annotations
@@ -44,7 +46,8 @@ class GtsamNonlinear(GtsamElimination):
         Raises
         ------
         SolverError
-            When the problem cannot be put into gtsam: inequalities, bounds, a loss or a manifold that it has not.
+            When the problem cannot be put into gtsam: inequalities, bounds, a loss or a manifold that it has
+            not.
         """
         start = time.perf_counter()
         state = problem.initial_state() if initial_state is None else initial_state
@@ -55,7 +58,8 @@ class GtsamNonlinear(GtsamElimination):
         try:
             values = self._iterate(view, run)
         except RuntimeError as error:
-            # An exception of a problem's own linearisation passes through gtsam as it is and is not ours to swallow.
+            # An exception of a problem's own linearisation passes through gtsam as it is and is not ours to
+            # swallow.
             if "ndetermina" not in str(error):
                 raise
             values = run.best if run.best is not None else view.values
@@ -215,17 +219,36 @@ class GtsamLevenbergMarquardt(_Batch):
 
 
 class GtsamIsam2(GtsamNonlinear):
-    """``gtsam.ISAM2``: the factors are fed in increments, then updated until nothing is relinearised any more.
+    """``gtsam.ISAM2``: the factors are fed, then updated until nothing is relinearised any more.
 
-    ``extra={"increments": 5}`` says in how many parts; every part brings the variables that its factors touch and must leave the
-    variables so far determined, so parts that do not are joined with the next. A graph that cannot be cut so goes in at once.
+    The whole graph at once by default; ``extra={"increments": n}`` feeds it in up to n parts, each of which
+    leaves the variables so far determined. What little the first parts know can lead to another valley than
+    the whole graph: a run that does not end well is begun again with the whole graph at once, and the message
+    says so.
     """
 
     name: ClassVar[str] = "gtsam-isam2"
 
     def _iterate(self, view: NonlinearView, run: _Run) -> Any:
-        gtsam = load_gtsam()
+        run.record(view.values, view.graph.error(view.values))
+        parts = increments(view, int(self.options.extra.get("increments", 1)))
+        if len(parts) > 1:
+            try:
+                values = self._feed(view, run, parts)
+            except RuntimeError as error:
+                if "ndetermina" not in str(error):
+                    raise
+            else:
+                if run.status is Status.SOLVED or run.exhausted():
+                    return values
+            run.stalls = 0
+        values = self._feed(view, run, increments(view, 1))
+        if len(parts) > 1:
+            run.message += " (fed whole: in increments it led away)"
+        return values
 
+    def _feed(self, view: NonlinearView, run: _Run, parts: list[tuple[Any, Any]]) -> Any:
+        gtsam = load_gtsam()
         params = gtsam.ISAM2Params()
         params.setFactorization("QR")
         params.relinearizeSkip = 1
@@ -233,8 +256,7 @@ class GtsamIsam2(GtsamNonlinear):
         params.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(0.0))
         params.setRelinearizeThreshold(min(self.options.tolerance, 1e-6))
         isam = gtsam.ISAM2(params)
-        run.record(view.values, view.graph.error(view.values))
-        for graph, values in increments(view, int(self.options.extra.get("increments", 5))):
+        for graph, values in parts:
             isam.update(graph, values)
             run.iterations += 1
         values = isam.calculateBestEstimate()
@@ -255,8 +277,9 @@ class GtsamIsam2(GtsamNonlinear):
 def increments(view: NonlinearView, parts: int) -> list[tuple[Any, Any]]:
     """The graph of a view cut into parts, each of which leaves all variables so far determined.
 
-    A part brings some variables, in their order, with every factor that needs none of the later ones: a prior comes with its variable, so
-    that no part is solved with less information on its variables than it has to be.
+    A part brings some variables, in their order, with every factor that needs none of the later ones: a prior
+    comes with its variable, so that no part is solved with less information on its variables than it has to
+    be.
 
     Parameters
     ----------

@@ -36,6 +36,8 @@ class LinearValues:
         E (p, n).
     hard_rhs : ndarray
         (p,).
+
+    None of them may change afterwards: factors keep them.
     """
 
     entries: FloatArray

@@ -43,23 +43,21 @@ def make_estimate(
     posterior = time.perf_counter()
     status, message = result.status, result.message
     factor: Factor | None = None
-    active: ActiveSet | None = None
+    observability: Observability | None = None
+    source: CovarianceSource | None = None
     # Without inequalities the covariance does not depend on the iterate: a solver that gave none up can still be told what was missing.
     judgeable = finite or (status is Status.UNOBSERVABLE and not system.has_inequalities)
     if judgeable and status not in (Status.INFEASIBLE, Status.UNBOUNDED):
         active = active_set(system, solution, result.row_weights)
         try:
             factor = _factor(result, solver, active)
+            score = _score(problem, result.state)
+            observability = _observe(system, factor, score, problem)
+            source = _source(factor, score)
         except NotSolvedError as error:
             message = f"{message}; no covariance: {error}" if message else f"no covariance: {error}"
-    observability = None
-    source: CovarianceSource | None = None
-    if factor is not None:
-        score = _score(problem, result.state)
-        source = _source(factor, score)
-        observability = _observe(system, factor, score, problem)
-        if status in (Status.SOLVED, Status.UNOBSERVABLE):
-            status, message = _judge(status, message, observability, factor, system, problem)
+    if factor is not None and observability is not None and status in (Status.SOLVED, Status.UNOBSERVABLE):
+        status, message = _judge(status, message, observability, factor, system, problem)
     elif status is Status.INFEASIBLE:
         message = _infeasible_words(system, solution, message)
     ended = time.perf_counter()
@@ -135,7 +133,14 @@ def _score(problem: object, state: State | None) -> FloatArray | None:
 def _source(factor: Factor, score: FloatArray | None) -> CovarianceSource:
     if score is None:
         return factor.solve
-    return lambda columns: factor.solve(score @ factor.solve(columns))
+
+    def sandwich(columns: FloatArray) -> FloatArray:
+        inner = factor.solve(columns)
+        lost = ~np.isfinite(inner).all(axis=0)
+        out = factor.informed_solve(score @ np.where(lost, 0.0, inner))
+        return np.where(lost, np.nan, out)
+
+    return sandwich
 
 
 def _observe(
@@ -143,7 +148,7 @@ def _observe(
 ) -> Observability:
     judged = [variable for variable in system.variables if variable.resolution is not None]
     if len(judged) > 20:
-        factor.variances()  # one selected inverse then holds all the marginals
+        factor.prepare_marginals()
 
     def marginal(name: str) -> FloatArray:
         where = np.arange(system.size)[system.columns[name]]
@@ -155,10 +160,12 @@ def _observe(
         return np.asarray(spread.T @ score @ spread)
 
     null = factor.null.parts(system.variables) if factor.null.count else {}
+    found = observe(system.variables, marginal, _describe(problem), null=null)
+    if found.complete:
+        return found
+    # Advice may cost a look at the data: it is asked for only when something is missing.
     advice = getattr(problem, "advice", "")
-    # Advice may cost a look at the data: it is only asked for when something is missing.
-    found = observe(system.variables, marginal, _describe(problem), "?", null)
-    return replace(found, advice=str(advice() if callable(advice) else advice)) if found.advice else found
+    return replace(found, advice=str(advice() if callable(advice) else advice))
 
 
 def _describe(problem: object) -> Describe:

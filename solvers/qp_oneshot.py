@@ -48,7 +48,7 @@ def solve_with_qpsolvers(
     qpsolvers: Any = import_module("qpsolvers")
 
     parts: list[Any] = [form.P, form.q, form.G, form.h, form.A, form.b, form.lb, form.ub]
-    if backend in DENSE:
+    if backend in DENSE or settings.get("backend") == "dense":
         parts = [part.toarray() if sp.issparse(part) else part for part in parts]
     keywords = dict(settings)
     initial = None

@@ -54,12 +54,11 @@ class SparseSystem:
     def __init__(self, indptr: IntArray, indices: IntArray, size: int, hard: sp.csr_array) -> None:
         self.size, self.hard_rows = size, hard.shape[0]
         self._pattern = (indices, indptr)
-        self._hard_pattern = (hard.indices, hard.indptr)
-        stacked = (
-            np.concatenate([indices, hard.indices]),
+        self._gram = GramPattern(
             np.concatenate([indptr, indptr[-1] + hard.indptr[1:]]),
+            np.concatenate([indices, hard.indices]),
+            size,
         )
-        self._gram = GramPattern(stacked[1], stacked[0], size)
         # Columns n.. of the upper triangle: a row of E each, then its own diagonal entry.
         ends = np.cumsum(np.diff(hard.indptr) + 1)
         self._tail_diagonal = ends - 1
@@ -74,6 +73,7 @@ class SparseSystem:
         self._probe = np.random.default_rng(0).standard_normal(size)
         self._probe /= np.linalg.norm(self._probe)
         self.stamp = 0
+        self.stalled = False
         self._regularisation = REGULARISATIONS[0]
 
     # ---- values -----------------------------------------------------------------------------------------------
@@ -81,7 +81,6 @@ class SparseSystem:
     def update(self, entries: FloatArray, rhs: FloatArray, hard: sp.csr_array, hard_rhs: FloatArray) -> None:
         """New values: non-zeros of A, b, E (with the pattern given) and e; factors and solves."""
         self.stamp += 1
-        self.stalled = False
         self._inverse: SelectedInverse | None = None
         self._matrix = sp.csr_array((entries, *self._pattern), shape=(rhs.size, self.size))
         self._hard = hard
@@ -133,7 +132,9 @@ class SparseSystem:
         x, y = np.zeros(count), np.zeros(self.hard_rows)
         residual, gap = rhs, hard_rhs
         floor = max(ENERGY_TOLERANCE, 1e-14 * float(np.linalg.norm(rhs)))
-        before, self.stalled = np.inf, False
+        before = remaining = np.inf
+        # An error above either of these is one that singular values can still mend.
+        tolerable = max(1e-6, 1e-10 * float(np.linalg.norm(rhs)))
         root = np.sqrt(self._row_weight)
         for step in range(MOST_REFINEMENTS + 1):
             right = matrix.T @ residual
@@ -142,17 +143,19 @@ class SparseSystem:
             change = self._ldl.solve(right)
             moved = matrix @ change[:count]
             energy = float(np.hypot(np.linalg.norm(moved), np.linalg.norm(root * (hard @ change[:count]))))
-            if step > 1 and energy > 0.5 * before:
+            if not np.isfinite(energy) or (step > 1 and energy > 0.5 * before):
                 # At rounding level already, or refinement cannot gain on the error of the factor.
-                self.stalled = before > 1e-6 and before > 1e-10 * float(np.linalg.norm(rhs))
+                remaining = before
                 break
             x += change[:count]
             y += change[count:]
             if step and (energy <= floor or energy**2 <= floor * before):
+                remaining = 0.0
                 break
-            before = energy
+            before = remaining = energy
             residual = rhs - matrix @ x
             gap = hard_rhs - hard @ x if self.hard_rows else hard_rhs
+        self.stalled = remaining > tolerable
         self.x, self.y = self.null.project_out(x), y
         self.violated = self._find_violated(hard_rhs)
 
@@ -215,6 +218,11 @@ class SparseSystem:
             out[part] = self.apply(columns)[part, np.arange(part.size)]
         return np.maximum(out, 0.0)
 
+    def prepare_blocks(self) -> None:
+        """Compute the selected inverse, if `block` may use it."""
+        if self._selectable and not self.null.count:
+            self.selected()
+
     def block(self, indices: IntArray) -> FloatArray | None:
         """Block of P at `indices` when the selected inverse is there and holds it."""
         if self._inverse is None or self.null.count or not self._selectable:
@@ -268,7 +276,9 @@ class SparseSystem:
         """Orthonormal scaled directions (n, k) of which A and E see little, by block inverse iteration."""
         rng = np.random.default_rng(0)
         known = np.flatnonzero(~self._empty)
-        empty = np.eye(self.size)[:, self._empty] if self._empty.any() else np.empty((self.size, 0))
+        untouched = np.flatnonzero(self._empty)
+        empty = np.zeros((self.size, untouched.size))
+        empty[untouched, np.arange(untouched.size)] = 1.0
         width = 4
         while True:
             width = min(width, known.size)

@@ -55,7 +55,8 @@ def rng() -> np.random.Generator:
 def broad_trial(dataset: Callable[[str], Path]) -> Callable[..., tuple[PoseStream, ImuStream]]:
     """Robot (optical body) and hand (IMU) streams of a `broad` trial.
 
-    The body of the pose stream is moved by a rigid transform, ``p' = p + R offset``, ``R' = R Exp(turn)``; `half` takes one half of the motion.
+    The body of the pose stream is moved by a rigid transform, ``p' = p + R offset``, ``R' = R Exp(turn)``;
+    `half` takes one half of the motion.
     """
 
     def load(

@@ -37,12 +37,12 @@ def joint_columns(model: Any, names: Sequence[str] | None, width: int) -> IntArr
     Columns are matched by joint name where they have one, and taken in the model's order where they are called ``q1 ... qn``.
     """
     known = {
-        model.names[i]: int(model.joints[i].idx_q)
-        for i in range(1, model.njoints)
-        if model.joints[i].nq == 1
+        model.names[i]: int(model.joints[i].idx_q) for i in range(1, model.njoints) if model.joints[i].nq == 1
     }
     if len(known) != model.njoints - 1:
-        raise InputError("robot.urdf", "joints of one coordinate each (revolute or prismatic)", "a joint with more")
+        raise InputError(
+            "robot.urdf", "joints of one coordinate each (revolute or prismatic)", "a joint with more"
+        )
     if names is not None and all(name in known for name in names):
         return np.array([known[name] for name in names], dtype=np.intp)
     generic = names is None or all(name.lstrip("q").isdigit() for name in names)

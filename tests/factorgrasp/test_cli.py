@@ -15,7 +15,7 @@ from typer.testing import CliRunner, Result
 
 from factorgrasp import __version__, lie
 from factorgrasp.cli import EXAMPLE, app
-from factorgrasp.recordings import read_table
+from factorgrasp.recordings import PoseStream, read_poses, read_table, write_csv
 from factorgrasp.simulation.cehajic2015 import ENCODER_POSES, XSENS, cehajic2015
 from factorgrasp.simulation.grasp_files import write_recording
 
@@ -249,6 +249,28 @@ def test_bad_arguments_are_2(exciting: Path, tmp_path: Path) -> None:
     assert run("solve").exit_code == 2
     assert run("slove").exit_code == 2
     assert not (tmp_path / "out").exists()
+
+
+def test_hand_with_poses(exciting: Path, tmp_path: Path) -> None:
+    """A camera on the hand in a world of its own, without noise but for rounding: the grasp is found to a hundredth of a millimetre."""
+    robot = read_poses(exciting.parent / "robot.csv")
+    grasp_rotation, grasp = lie.so3_exp([0.4, -1.0, 0.3]), np.array([0.2, -0.1, 0.5])
+    world_rotation, world = lie.so3_exp([1.0, 0.5, -2.0]), np.array([3.0, 1.0, -2.0])
+    rotation = world_rotation @ robot.rotation @ grasp_rotation
+    position = (robot.position + robot.rotation @ grasp) @ world_rotation.T + world
+    hand = PoseStream(robot.t, position, lie.matrix_to_quaternion_wxyz(rotation))
+    write_csv(tmp_path / "robot.csv", robot)
+    write_csv(tmp_path / "camera.csv", hand)
+    (tmp_path / "grasp.toml").write_text(
+        'kind = "grasp_pose"\n[robot]\nfile = "robot.csv"\n[hand]\nfile = "camera.csv"\n', encoding="utf-8"
+    )
+    result = run("solve", tmp_path / "grasp.toml", "--out", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    values = json.loads((tmp_path / "out" / "estimate.json").read_text(encoding="utf-8"))["values"]["grasp"]
+    np.testing.assert_allclose(values["translation"], grasp, atol=1e-5)
+    found = lie.quaternion_wxyz_to_matrix(values["rotation_wxyz"])
+    assert lie.angle_between(found, grasp_rotation) < 1e-5
+    assert "How well both sides agree" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
 
 
 def test_warnings_are_lines_and_stand_in_the_report(exciting: Path, tmp_path: Path) -> None:

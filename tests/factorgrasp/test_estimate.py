@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import subprocess
 import sys
@@ -42,8 +43,13 @@ def handmade(covariance: np.ndarray, status: Status = Status.SOLVED) -> Estimate
         variables=variables,
         values=values,
         message="because" if status is not Status.SOLVED else "",
-        residuals=(TermSummary("gyroscope", 30, 33.0, 1.05, 2.5), TermSummary("gap", 0, 0.0, float("nan"), 0.0, 0.25)),
-        observability=observe(variables, lambda name: covariance[:3, :3], default_words, "turn about the other axis"),
+        residuals=(
+            TermSummary("gyroscope", 30, 33.0, 1.05, 2.5),
+            TermSummary("gap", 0, 0.0, float("nan"), 0.0, 0.25),
+        ),
+        observability=observe(
+            variables, lambda name: covariance[:3, :3], default_words, "turn about the other axis"
+        ),
         objective=16.5,
         iterations=3,
         certificate=Certificate(1e-9, 2e-9, float("nan")),
@@ -74,8 +80,19 @@ def unobservable() -> Estimate:
 
 
 def equal(a: Estimate, b: Estimate) -> None:
-    assert (a.status, a.kind, a.solver, a.message, a.variables) == (b.status, b.kind, b.solver, b.message, b.variables)
-    assert (a.iterations, a.problem_hash, a.versions, a.timing) == (b.iterations, b.problem_hash, b.versions, b.timing)
+    assert (a.status, a.kind, a.solver, a.message, a.variables) == (
+        b.status,
+        b.kind,
+        b.solver,
+        b.message,
+        b.variables,
+    )
+    assert (a.iterations, a.problem_hash, a.versions, a.timing) == (
+        b.iterations,
+        b.problem_hash,
+        b.versions,
+        b.timing,
+    )
     for mine, theirs in ((a.values, b.values), (a.multipliers, b.multipliers)):
         assert list(mine) == list(theirs)
         for name, value in mine.items():
@@ -102,13 +119,17 @@ def test_what_was_saved_comes_back(tmp_path: Path, covariance: np.ndarray) -> No
     loaded = Estimate.load(path.parent)
     equal(estimate, loaded)
     np.testing.assert_allclose(loaded.covariance(), covariance, rtol=1e-14)
-    np.testing.assert_allclose(loaded.covariance("pose", "lever arm"), estimate.covariance("pose", "lever arm"))
+    np.testing.assert_allclose(
+        loaded.covariance("pose", "lever arm"), estimate.covariance("pose", "lever arm")
+    )
     assert sorted(p.name for p in path.parent.iterdir()) == ["estimate.json", "estimate.npz"]
 
 
 def test_a_real_estimate_comes_back(tmp_path: Path, rng: np.random.Generator) -> None:
     problem = LeastSquares(
-        [Variable("x", 4, resolution=1.0)], [Term("rows", 9, ("x",), loss=Huber(), group=3)], [Constraint("sum", 1, ("x",))]
+        [Variable("x", 4, resolution=1.0)],
+        [Term("rows", 9, ("x",), loss=Huber(), group=3)],
+        [Constraint("sum", 1, ("x",))],
     )
     problem.set_term("rows", {"x": rng.normal(size=(9, 4))}, 5.0 * rng.normal(size=9))
     problem.set_constraint("sum", {"x": np.ones((1, 4))}, 1.0)
@@ -158,12 +179,14 @@ def test_a_failed_save_leaves_the_last_one(tmp_path: Path, covariance: np.ndarra
     assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == before
 
 
-def test_large_problems_keep_the_covariance_of_every_variable(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_large_problems_keep_the_covariance_of_every_variable(
+    tmp_path: Path, rng: np.random.Generator
+) -> None:
     names = [f"link {i}" for i in range(150)]
     problem = LeastSquares(
         [Variable(name, 3) for name in names],
         [Term(f"row {name}", 3, (name,), Covariance.diagonal(rng.uniform(0.1, 2.0, 3))) for name in names]
-        + [Term(f"tie {a} {b}", 3, (a, b)) for a, b in zip(names, names[1:], strict=False)],
+        + [Term(f"tie {a} {b}", 3, (a, b)) for a, b in itertools.pairwise(names)],
     )
     for term in problem.terms.values():
         problem.set_term(term.name, {v: rng.normal(size=(3, 3)) for v in term.variables}, rng.normal(size=3))
@@ -249,7 +272,9 @@ def test_long_problems_are_cut_in_print(rng: np.random.Generator) -> None:
 def test_readouts(covariance: np.ndarray, rng: np.random.Generator) -> None:
     estimate = handmade(covariance)
     matrix = rng.normal(size=(2, 12))
-    np.testing.assert_allclose(estimate.readout_covariance(matrix), matrix @ covariance @ matrix.T, rtol=1e-12)
+    np.testing.assert_allclose(
+        estimate.readout_covariance(matrix), matrix @ covariance @ matrix.T, rtol=1e-12
+    )
     np.testing.assert_allclose(estimate.sd("lever arm"), np.sqrt(np.diag(covariance)[3:6]))
     with pytest.raises(InputError, match="12 columns"):
         estimate.readout_covariance(np.ones((1, 5)))
@@ -267,7 +292,10 @@ def test_observability_separates_what_nothing_informs_from_what_is_weak() -> Non
     variables = [Variable("arm", 3, unit="m", resolution=0.1), Variable("free", 2)]
     null = {"arm": np.array([[0.0], [0.0], [1.0]]), "free": np.array([[0.6], [0.8]])}
     found = observe(variables, lambda name: np.diag([0.01, 4e-4, 777.0]), advice="move", null=null)
-    assert [d.variable for d in found.missing] == ["arm", "free"] or [d.variable for d in found.missing] == ["free", "arm"]
+    assert [d.variable for d in found.missing] == ["arm", "free"] or [d.variable for d in found.missing] == [
+        "free",
+        "arm",
+    ]
     assert all(d.sd == np.inf for d in found.missing)
     assert found.advice == "move"
     known = [d for d in found.directions if d.observable]
@@ -281,7 +309,10 @@ def test_words_of_a_direction() -> None:
     spread = default_words(variable, np.full(100, 0.1))
     assert spread.endswith("...")
     assert spread.count("+0.10") == 3
-    assert default_words(Variable("arm", 2, components=("x", "y")), np.array([0.6, -0.8])) == "arm along -0.80 y +0.60 x"
+    assert (
+        default_words(Variable("arm", 2, components=("x", "y")), np.array([0.6, -0.8]))
+        == "arm along -0.80 y +0.60 x"
+    )
 
 
 # ---- provenance and import --------------------------------------------------------------------------------------
@@ -290,14 +321,30 @@ def test_words_of_a_direction() -> None:
 def test_problem_hash_tells_problems_apart(rng: np.random.Generator) -> None:
     A, b = rng.normal(size=(4, 2)), rng.normal(size=4)
 
-    def make(b: np.ndarray = b, variance: float = 1.0, bound: float = np.inf, loss: Huber | None = None) -> str:
-        problem = LeastSquares([Variable("x", 2)], [Term("rows", 4, ("x",), Covariance.scalar(variance), loss)])
+    def make(
+        b: np.ndarray = b, variance: float = 1.0, bound: float = np.inf, loss: Huber | None = None
+    ) -> str:
+        problem = LeastSquares(
+            [Variable("x", 2)], [Term("rows", 4, ("x",), Covariance.scalar(variance), loss)]
+        )
         problem.set_term("rows", {"x": A}, b)
         problem.set_bounds("x", -np.inf, bound)
         return problem_hash("kind", problem)
 
     assert make() == make()
-    assert len({make(), make(b + 1e-15), make(variance=2.0), make(bound=1.0), make(loss=Huber()), make(loss=Huber(2.0))}) == 6
+    assert (
+        len(
+            {
+                make(),
+                make(b + 1e-15),
+                make(variance=2.0),
+                make(bound=1.0),
+                make(loss=Huber()),
+                make(loss=Huber(2.0)),
+            }
+        )
+        == 6
+    )
 
 
 def test_versions_name_what_computed() -> None:

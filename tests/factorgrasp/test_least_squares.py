@@ -126,9 +126,12 @@ def test_a_new_covariance_takes_the_place_of_the_old(dense: Dense, rng: np.rando
 
 
 @pytest.mark.parametrize("loss", [Huber(1.2), Cauchy(0.8), GemanMcClure(2.0)])
-def test_robust_weights_act_on_whole_groups(loss: Huber | Cauchy | GemanMcClure, rng: np.random.Generator) -> None:
+def test_robust_weights_act_on_whole_groups(
+    loss: Huber | Cauchy | GemanMcClure, rng: np.random.Generator
+) -> None:
     problem = LeastSquares(
-        [Variable("x", 2)], [Term("r", 6, ("x",), Covariance.scalar(0.25), loss, group=3), Term("p", 2, ("x",))]
+        [Variable("x", 2)],
+        [Term("r", 6, ("x",), Covariance.scalar(0.25), loss, group=3), Term("p", 2, ("x",))],
     )
     A, b = rng.normal(size=(6, 2)), 3.0 * rng.normal(size=6)
     problem.set_term("r", {"x": A}, b)
@@ -163,7 +166,7 @@ def test_not_finite_rows_are_named(dense: Dense) -> None:
     b = dense.b[6:10].copy()
     b[2] = np.nan
     dense.problem.set_term("diagonal", {}, b)
-    with pytest.raises(InputError, match="term diagonal.*1 of its 4 rows, first in row 2"):
+    with pytest.raises(InputError, match=r"term diagonal.*1 of its 4 rows, first in row 2"):
         dense.problem.whitened()
     dense.fill()
     A = dense.A[:6, :4].copy()

@@ -12,7 +12,7 @@ from factorgrasp.errors import InputError
 from factorgrasp.grasp_file import build
 from factorgrasp.lie import quaternion_wxyz_to_matrix
 from factorgrasp.problem_file import load_problem
-from factorgrasp.problems import GraspNoise, GraspPose, GraspSettings
+from factorgrasp.problems import GraspNoise, GraspPose, GraspPoseFromPoses, GraspSettings
 from factorgrasp.recordings import ImuStream, JointStream, PoseStream, write_csv
 from factorgrasp.simulation.cehajic2015 import ENCODER_POSES, XSENS, cehajic2015
 from factorgrasp.simulation.grasp_files import write_recording
@@ -106,8 +106,12 @@ def test_a_log_of_everything_serves_both_sides(recorded: Path) -> None:
     assert isinstance(problem.streams[0], PoseStream)
     problem = build({"robot": {"file": "all.csv", "columns": "imu"}, "hand": {"file": "all.csv"}}, recorded)
     assert isinstance(problem.streams[0], ImuStream)
-    with pytest.raises(InputError, match=r"\[hand\] file: expected an IMU .* found PoseStream"):
-        build({"robot": {"file": "all.csv"}, "hand": {"file": "all.csv", "columns": "poses"}}, recorded)
+    both = {"robot": {"file": "all.csv"}, "hand": {"file": "all.csv", "columns": "poses"}}
+    assert isinstance(build(both, recorded), GraspPoseFromPoses)
+    with pytest.raises(InputError, match=r"\[robot\] gravity: expected an IMU in \[hand\] file"):
+        build({**both, "robot": {"file": "all.csv", "gravity": [0, 0, -9.8]}}, recorded)
+    with pytest.raises(InputError, match=r"\[noise\] gyro_density: expected a known key"):
+        build({**both, "noise": {"gyro_density": 1e-3}}, recorded)
 
 
 def test_joint_positions_through_a_urdf(recorded: Path, write: Callable[[str], Path]) -> None:

@@ -195,6 +195,15 @@ def test_ellipse_is_the_shadow_of_the_ellipsoid(translation: tuple[float, float,
     assert made.axes == [axes]
 
 
+def test_rms_per_stretch_keeps_the_power(rng: np.random.Generator) -> None:
+    t = np.concatenate([np.arange(0.0, 10.0, 0.001), np.arange(20.0, 30.0, 0.001)])
+    values = rng.normal(size=(t.size, 2)) * (1.0, 3.0)
+    centres, rms = plots.rms_per_stretch(t, values, 90)
+    assert centres.size == 60
+    assert not np.any((centres > 10.0) & (centres < 20.0))
+    np.testing.assert_allclose(np.mean(rms**2, axis=0), np.mean(values**2, axis=0), rtol=0.02)
+
+
 def test_lines_break_at_gaps() -> None:
     t = np.array([0.5, 1.0, 1.5, 4.5, 5.0])
     times, values = plots._broken(t, np.arange(5.0)[:, None], 1.0)

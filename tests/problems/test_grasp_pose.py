@@ -116,7 +116,9 @@ def test_base_tilt_is_found_when_asked_for():
     found = solve(problem)
     sd = found.estimate.sd("base_tilt")
     # 0.18 m/s^2 of gravity's 9.81 pointing sideways.
-    assert np.linalg.norm(found.estimate.values["base_tilt"]) == pytest.approx(np.hypot(0.1, 0.15) / 9.80665, abs=4 * sd.max())
+    assert np.linalg.norm(found.estimate.values["base_tilt"]) == pytest.approx(
+        np.hypot(0.1, 0.15) / 9.80665, abs=4 * sd.max()
+    )
     error = grasp_error(found, run.truth)
     assert nees(error, found.covariance) < 6 * 3.0
     assert np.linalg.norm(error[3:]) < np.linalg.norm(grasp_error(without, run.truth)[3:])
@@ -127,7 +129,11 @@ def test_base_tilt_is_found_when_asked_for():
 
 
 def test_robot_side_as_slow_poses_or_as_imu(recording):
-    slow = cehajic2015(seed=5, duration=30.0, robot=RobotSensing(output="pose", rate=100.0, position_sd=1e-4, rotation_sd=2e-4))
+    slow = cehajic2015(
+        seed=5,
+        duration=30.0,
+        robot=RobotSensing(output="pose", rate=100.0, position_sd=1e-4, rotation_sd=2e-4),
+    )
     found = solve(GraspPose(slow.robot, slow.hand))
     assert nees(grasp_error(found, slow.truth), found.covariance) < 6 * 3.0
     assert np.linalg.norm(grasp_error(found, slow.truth)[3:]) < 0.003
@@ -161,16 +167,21 @@ def test_robot_side_as_joint_positions():
     q = 0.5 * np.sin((0.6 + 0.25 * speed) * t[:, None] * 2 + phase)
     # Truth from forward kinematics at many times the rate, differentiated centrally.
     h = 1e-4
-    at = [end_effector_poses(model, frame, 0.5 * np.sin((0.6 + 0.25 * speed) * (t[:, None] + d) * 2 + phase)) for d in (-h, 0.0, h)]
+    at = [
+        end_effector_poses(model, frame, 0.5 * np.sin((0.6 + 0.25 * speed) * (t[:, None] + d) * 2 + phase))
+        for d in (-h, 0.0, h)
+    ]
     R = [lie.quaternion_wxyz_to_matrix(quaternion) for _, quaternion in at]
     acceleration = (at[2][0] - 2 * at[1][0] + at[0][0]) / h**2
     ahead, behind = (lie.so3_log(np.swapaxes(R[1], 1, 2) @ R[k]) / h for k in (2, 0))
     w, al = 0.5 * (ahead - behind), (ahead + behind) / h
-    f = np.einsum("nji,nj->ni", R[1], acceleration + [0, 0, 9.80665])
+    f = np.einsum("nji,nj->ni", R[1], acceleration + np.array([0, 0, 9.80665]))
     R_r_h, p_r_h = lie.so3_exp(np.array([0.4, -1.1, 0.7])), np.array([0.05, -0.12, 0.2])
     at_hand = f + np.cross(al, p_r_h) + np.cross(w, np.cross(w, p_r_h))
     hand = ImuStream(
-        t, w @ R_r_h + 0.008 * rng.standard_normal(w.shape), at_hand @ R_r_h + 0.03 * rng.standard_normal(w.shape)
+        t,
+        w @ R_r_h + 0.008 * rng.standard_normal(w.shape),
+        at_hand @ R_r_h + 0.03 * rng.standard_normal(w.shape),
     )
     robot = JointStream(t, q, tuple(f"q{i + 1}" for i in range(model.nq)))
     found = solve(GraspPose(robot, hand, robot_model=model, frame=frame))
@@ -194,7 +205,7 @@ def test_gaps_are_used_around_and_counted(recording, estimate):
     found = solve(GraspPose(recording.robot, hand))
     assert nees(grasp_error(found, recording.truth), found.covariance) < 6 * 3.0
     count, seconds, rows = found.diagnostics.hand_gaps
-    assert rows == 2005 and count == 7
+    assert (rows, count) == (2005, 7)
     assert seconds == pytest.approx(3.5, abs=0.05)
     assert found.diagnostics.windows_dropped > estimate.diagnostics.windows_dropped
     # A wild value inside a gap row must not matter at all.
@@ -224,7 +235,8 @@ def test_the_printed_motion_is_called_unobservable_in_words():
     assert found.status is Status.UNOBSERVABLE
     missing = found.observability.missing
     assert [d.variable for d in missing] == ["translation"]
-    assert "rotation axis" in missing[0].words and "second axis" in found.message
+    assert "rotation axis" in missing[0].words
+    assert "second axis" in found.message
     axis = np.array([10.0, 40.0, 20.0]) / np.linalg.norm([10, 40, 20])
     assert abs(missing[0].vector @ axis) > 0.999
     # What the motion did show is right, within its sigma.
@@ -235,7 +247,9 @@ def test_the_printed_motion_is_called_unobservable_in_words():
 
 def test_a_prior_fills_in_what_the_motion_does_not_show():
     run = cehajic2015(seed=0, motion="printed", duration=20.0)
-    prior = GraspPrior(translation=run.truth.translation + [0.003, -0.004, 0.002], translation_sd=0.005)
+    prior = GraspPrior(
+        translation=run.truth.translation + np.array([0.003, -0.004, 0.002]), translation_sd=0.005
+    )
     found = solve(GraspPose(run.robot, run.hand, prior=prior))
     assert found.status is Status.SOLVED
     assert np.linalg.norm(found.translation - run.truth.translation) < 0.01
@@ -248,7 +262,9 @@ def test_still_and_unrelated_recordings_are_said_to_be_so():
     rng = np.random.default_rng(0)
     t = np.arange(8000) / 400.0
     still = PoseStream(t, 1e-5 * rng.standard_normal((t.size, 3)), np.tile([1.0, 0, 0, 0], (t.size, 1)))
-    hand = ImuStream(t, 0.01 * rng.standard_normal((t.size, 3)), [0, 0, 9.8] + 0.05 * rng.standard_normal((t.size, 3)))
+    hand = ImuStream(
+        t, 0.01 * rng.standard_normal((t.size, 3)), [0, 0, 9.8] + 0.05 * rng.standard_normal((t.size, 3))
+    )
     found = solve(GraspPose(still, hand))
     assert found.status is Status.UNOBSERVABLE
     assert "hardly rotates" in found.message

@@ -47,7 +47,8 @@ def test_halves_agree_within_three_claimed_sigmas(broad_trial, trial):
     sd = np.sqrt(np.diag(first.covariance) + np.diag(second.covariance))
     assert np.max(np.abs(difference / sd)) < 3.0
     # Honest, and still useful: millimetres and hundredths of a degree.
-    assert np.max(sd[3:]) < 2e-3 and np.max(sd[:3]) < np.deg2rad(0.1)
+    assert np.max(sd[3:]) < 2e-3
+    assert np.max(sd[:3]) < np.deg2rad(0.1)
 
 
 def test_drone_poses_recover_a_virtual_body_and_the_published_biases(dataset):
@@ -67,13 +68,17 @@ def test_drone_poses_recover_a_virtual_body_and_the_published_biases(dataset):
     error = found.error_to(turn.T, -turn.T @ offset)
     sd = np.sqrt(np.diag(found.covariance))
     assert np.max(np.abs(error[3:] / sd[3:])) < 3.0
-    assert np.linalg.norm(error[3:]) < 5e-3 and np.rad2deg(np.linalg.norm(error[:3])) < 0.2
+    assert np.linalg.norm(error[3:]) < 5e-3
+    assert np.rad2deg(np.linalg.norm(error[:3])) < 0.2
     # Biases of the ground truth's own filter, in the last seconds of the excerpt.
     np.testing.assert_allclose(found.gyro_bias, truth[-1, 11:14], atol=1.5e-3)
     np.testing.assert_allclose(found.accelerometer_bias, truth[-1, 14:17], atol=0.03)
 
 
-@pytest.mark.parametrize("name", ["V_300_Sequencia1", "V_500_Sequencia1", "V_800_Sequencia1", "eV50p_Sequencia1", "V_500_Sequencia4"])
+@pytest.mark.parametrize(
+    "name",
+    ["V_300_Sequencia1", "V_500_Sequencia1", "V_800_Sequencia1", "eV50p_Sequencia1", "V_500_Sequencia4"],
+)
 @pytest.mark.filterwarnings("ignore:.*shorter than 1")
 def test_interpolated_robot_poses_show_rotation_and_lag_but_no_lever_arm(dataset, name):
     table = np.genfromtxt(dataset(f"abb_imu_robot/MPU9150_{name}.csv"), delimiter=",", names=True)

@@ -43,7 +43,9 @@ def test_the_formulae_are_those_of_qpsolvers(problem: LeastSquares, rng: np.rand
     theirs = qpsolvers.Problem(qp.P, qp.q, qp.G, qp.h, qp.A, qp.b, qp.lb, qp.ub)
     # qpsolvers multiplies a load by its bound, so that loads may stand only on bounds that exist.
     box = rng.normal(size=8)
-    box = np.where(np.isfinite(qp.ub), np.maximum(box, 0.0), 0.0) - np.where(np.isfinite(qp.lb), np.maximum(-box, 0.0), 0.0)
+    box = np.where(np.isfinite(qp.ub), np.maximum(box, 0.0), 0.0) - np.where(
+        np.isfinite(qp.lb), np.maximum(-box, 0.0), 0.0
+    )
     mine = Solution(rng.normal(size=8), Status.SOLVED, rng.normal(size=2), rng.uniform(0.0, 1.0, 5), box)
     other = qpsolvers.Solution(theirs, x=mine.x, y=mine.y, z=mine.z, z_box=mine.z_box, found=True)
     for found in (check(qp, mine), check_least_squares(problem, mine)):
@@ -81,7 +83,9 @@ def test_wrong_signs_and_loads_on_missing_bounds_count_as_dual(problem: LeastSqu
 
 def test_a_feasible_point_that_is_no_optimum_has_a_gap() -> None:
     """``min (x - 2)^2 / 2  s.t.  x <= 1`` at x = 0 with the right multiplier for stationarity there."""
-    problem = LeastSquares([Variable("x", 1)], [Term("t", 1, ("x",))], [Constraint("c", 1, ("x",), "inequality")])
+    problem = LeastSquares(
+        [Variable("x", 1)], [Term("t", 1, ("x",))], [Constraint("c", 1, ("x",), "inequality")]
+    )
     problem.set_term("t", {"x": [[1.0]]}, 2.0)
     problem.set_constraint("c", {"x": [[1.0]]}, 1.0)
     found = check_least_squares(problem, Solution(np.zeros(1), Status.SOLVED, z=np.array([2.0])))

@@ -11,6 +11,7 @@ from numpy.linalg import lstsq
 from factorgrasp.errors import SolverError
 from factorgrasp.least_squares import Constraint, LeastSquares, Term
 from factorgrasp.solvers import kernels, linear_system, normal_equations
+from factorgrasp.solvers.base import Solution
 from factorgrasp.solvers.cholesky import Cholesky
 from factorgrasp.solvers.dense_system import DenseSystem
 from factorgrasp.solvers.kkt import Kkt
@@ -33,10 +34,20 @@ class Rows:
 
     def problem(self) -> LeastSquares:
         size = self.A.shape[1]
-        constraints = [Constraint("exact", len(self.e), ("x",), pattern={"x": self.E != 0.0})] if self.e.size else []
+        constraints = (
+            [Constraint("exact", len(self.e), ("x",), pattern={"x": self.E != 0.0})] if self.e.size else []
+        )
         out = LeastSquares(
             [Variable("x", size)],
-            [Term("rows", len(self.b), ("x",), Covariance.diagonal(self.variances), pattern={"x": self.A != 0.0})],
+            [
+                Term(
+                    "rows",
+                    len(self.b),
+                    ("x",),
+                    Covariance.diagonal(self.variances),
+                    pattern={"x": self.A != 0.0},
+                )
+            ],
             constraints,
         )
         return self.fill(out)
@@ -50,7 +61,9 @@ class Rows:
     def reference(self) -> tuple[np.ndarray, np.ndarray]:
         """Solution and covariance by singular values in the null space of E: no squaring, no elimination."""
         A, b = self.A / np.sqrt(self.variances)[:, None], self.b / np.sqrt(self.variances)
-        Q, R = np.linalg.qr(self.E.T, mode="complete") if self.e.size else (np.eye(A.shape[1]), np.empty((0, 0)))
+        Q, R = (
+            np.linalg.qr(self.E.T, mode="complete") if self.e.size else (np.eye(A.shape[1]), np.empty((0, 0)))
+        )
         count = self.e.size
         origin = Q[:, :count] @ np.linalg.solve(R[:count].T, self.e) if count else np.zeros(A.shape[1])
         Z = Q[:, count:]
@@ -82,7 +95,7 @@ def method(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> s
     return str(request.param)
 
 
-def solve(problem: LeastSquares, kind: type[Cholesky] = Kkt):  # noqa: ANN201
+def solve(problem: LeastSquares, kind: type[Cholesky] = Kkt) -> tuple[Cholesky, Solution]:
     solver = kind()
     solver.setup(problem)
     return solver, solver.solve()
@@ -100,7 +113,9 @@ def test_random_problems_match_lstsq(method: str, size: int, rows: int, rng: np.
 
 
 @pytest.mark.parametrize("hard", [0, 15])
-def test_covariances_over_twelve_orders_of_magnitude(method: str, hard: int, rng: np.random.Generator) -> None:
+def test_covariances_over_twelve_orders_of_magnitude(
+    method: str, hard: int, rng: np.random.Generator
+) -> None:
     for _ in range(3):
         case = banded(rng, 120, 240, hard, decades=12.0)
         _, solution = solve(case.problem())
@@ -152,7 +167,13 @@ def test_equalities_hold_and_multipliers_balance(method: str, rng: np.random.Gen
 
 def test_repeated_constraints_are_harmless(method: str, rng: np.random.Generator) -> None:
     case = banded(rng, 50, 100, hard=5)
-    twice = Rows(case.A, case.b, case.variances, np.vstack([case.E, 2.0 * case.E]), np.concatenate([case.e, 2.0 * case.e]))
+    twice = Rows(
+        case.A,
+        case.b,
+        case.variances,
+        np.vstack([case.E, 2.0 * case.E]),
+        np.concatenate([case.e, 2.0 * case.e]),
+    )
     _, solution = solve(twice.problem())
     assert solution.status is Status.SOLVED
     np.testing.assert_allclose(solution.x, case.reference()[0], atol=1e-8)
@@ -183,7 +204,11 @@ def test_missing_directions_are_named_and_the_rest_holds(method: str, rng: np.ra
     difference[np.arange(count - 1), np.arange(count - 1)] = -1.0
     difference[np.arange(count - 1), np.arange(1, count)] = 1.0
     problem = LeastSquares(
-        [Variable("chain", count), Variable("bias", 2, components=("bias x", "bias y")), Variable("known", 1)],
+        [
+            Variable("chain", count),
+            Variable("bias", 2, components=("bias x", "bias y")),
+            Variable("known", 1),
+        ],
         [
             Term("steps", count - 1, ("chain",), pattern={"chain": difference != 0.0}),
             Term("bias", 1, ("bias",), pattern={"bias": np.array([[True, False]])}),
@@ -235,7 +260,9 @@ def test_weak_priors_under_many_constraints(rng: np.random.Generator) -> None:
         E[i, i : i + 8] = rng.normal(size=8)
     measured = np.eye(size)[rng.choice(size, 60, replace=False)]
     variances = np.concatenate([np.full(60, 1e-4), np.full(size, 1e6)])
-    case = Rows(np.vstack([measured, np.eye(size)]), rng.normal(size=260), variances, E, rng.normal(size=hard))
+    case = Rows(
+        np.vstack([measured, np.eye(size)]), rng.normal(size=260), variances, E, rng.normal(size=hard)
+    )
     problem = case.problem()
     _, solution = solve(problem)
     assert solution.status is Status.SOLVED

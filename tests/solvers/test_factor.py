@@ -35,10 +35,20 @@ def make(rng: np.random.Generator, size: int = 60, hard: int = 0, soft: int = 0)
     constraints += [Constraint("limit", soft, ("x",), "inequality")] if soft else []
     problem = LeastSquares(
         [Variable("x", size)],
-        [Term("rows", 2 * size, ("x",), Covariance.diagonal(rng.uniform(0.1, 10.0, 2 * size)), pattern={"x": pattern})],
+        [
+            Term(
+                "rows",
+                2 * size,
+                ("x",),
+                Covariance.diagonal(rng.uniform(0.1, 10.0, 2 * size)),
+                pattern={"x": pattern},
+            )
+        ],
         constraints,
     )
-    problem.set_term("rows", {"x": np.where(pattern, rng.normal(size=pattern.shape), 0.0)}, rng.normal(size=2 * size))
+    problem.set_term(
+        "rows", {"x": np.where(pattern, rng.normal(size=pattern.shape), 0.0)}, rng.normal(size=2 * size)
+    )
     if hard:
         problem.set_constraint("exact", {"x": rng.normal(size=(hard, size))}, rng.normal(size=hard))
     if soft:
@@ -74,14 +84,24 @@ def test_row_weights_count(method: str, rng: np.random.Generator) -> None:
     weights = rng.uniform(0.2, 1.0, 120)
     matrix, _ = problem.whitened(weights)
     expected = np.linalg.inv((matrix.T @ matrix).toarray())
-    np.testing.assert_allclose(posterior_factor(problem, np.zeros(60), weights).variances(), np.diag(expected))
+    np.testing.assert_allclose(
+        posterior_factor(problem, np.zeros(60), weights).variances(), np.diag(expected)
+    )
 
 
 def test_active_constraints_remove_variance(method: str, rng: np.random.Generator) -> None:
     problem = make(rng, hard=2, soft=4)
-    problem.set_bounds("x", np.where(np.arange(60) == 5, 0.1, -np.inf), np.where(np.arange(60) == 9, 0.2, np.inf))
+    problem.set_bounds(
+        "x", np.where(np.arange(60) == 5, 0.1, -np.inf), np.where(np.arange(60) == 9, 0.2, np.inf)
+    )
     active = ActiveSet(np.array([True, False, True, False]), np.arange(60) == 5, np.arange(60) == 9)
-    hard = np.vstack([problem.equalities.matrix.toarray(), problem.inequalities.matrix.toarray()[[0, 2]], np.eye(60)[[5, 9]]])
+    hard = np.vstack(
+        [
+            problem.equalities.matrix.toarray(),
+            problem.inequalities.matrix.toarray()[[0, 2]],
+            np.eye(60)[[5, 9]],
+        ]
+    )
     factor = posterior_factor(problem, np.zeros(60), active=active)
     np.testing.assert_allclose(factor.solve(np.eye(60)), dense_covariance(problem, hard), atol=1e-9)
     assert factor.variances()[5] < 1e-12
@@ -94,7 +114,9 @@ def test_active_set_of_a_solved_problem(rng: np.random.Generator) -> None:
     assert estimate.status is Status.SOLVED
     x = estimate.values["x"]
     load = np.concatenate([estimate.multipliers["limit"], np.abs(estimate.multipliers["bounds of x"])])
-    solution = Solution(x, Status.SOLVED, z=estimate.multipliers["limit"], z_box=estimate.multipliers["bounds of x"])
+    solution = Solution(
+        x, Status.SOLVED, z=estimate.multipliers["limit"], z_box=estimate.multipliers["bounds of x"]
+    )
     found = active_set(problem, solution)
     said = np.concatenate([found.inequalities, found.lower | found.upper])
     np.testing.assert_array_equal(said, load > 1e-5)
@@ -102,7 +124,9 @@ def test_active_set_of_a_solved_problem(rng: np.random.Generator) -> None:
     # Slack alone finds the same set when a solver reports no multipliers, once the iterate sits on its bounds.
     exact = Solution(np.where(found.lower, -0.2, np.where(found.upper, 0.2, x)), Status.SOLVED)
     np.testing.assert_array_equal(active_set(problem, exact).lower, found.lower)
-    hard = np.vstack([problem.inequalities.matrix.toarray()[found.inequalities], np.eye(20)[found.lower | found.upper]])
+    hard = np.vstack(
+        [problem.inequalities.matrix.toarray()[found.inequalities], np.eye(20)[found.lower | found.upper]]
+    )
     np.testing.assert_allclose(estimate.covariance(), dense_covariance(problem, hard), atol=1e-7)
 
 
@@ -118,7 +142,9 @@ def test_contradicting_active_constraints_have_no_covariance(method: str) -> Non
 
 def test_nothing_is_said_along_null_directions(method: str) -> None:
     """Two unknowns of which only the sum is measured, and one that is known."""
-    problem = LeastSquares([Variable("x", 3)], [Term("sum", 1, ("x",)), Term("known", 1, ("x",), Covariance.scalar(4.0))])
+    problem = LeastSquares(
+        [Variable("x", 3)], [Term("sum", 1, ("x",)), Term("known", 1, ("x",), Covariance.scalar(4.0))]
+    )
     problem.set_term("sum", {"x": [[1.0, 1.0, 0.0]]}, [1.0])
     problem.set_term("known", {"x": [[0.0, 0.0, 1.0]]}, [1.0])
     factor = posterior_factor(problem, np.zeros(3))
@@ -147,6 +173,8 @@ def test_a_lent_factor_outlives_the_values_it_was_made_for(
     problem.set_term("rows", {"x": 5.0 * problem.jacobian.matrix.toarray()}, 0.0)
     if solver is Kkt:
         problem.set_constraint("exact", {"x": rng.normal(size=(3, 60))}, 0.0)
+    # Neither new values in the problem nor a new solve may reach what was lent.
+    np.testing.assert_allclose(factor.solve(np.eye(60)), expected, atol=1e-9)
     instance.solve()
     np.testing.assert_allclose(factor.solve(np.eye(60)), expected, atol=1e-9)
     changed = dense_covariance(problem, problem.equalities.matrix.toarray())
@@ -182,7 +210,9 @@ def test_selected_inverse(compiled: bool, indefinite: bool, rng: np.random.Gener
     assert found.block(empty) is None
 
 
-def test_without_numba_everything_still_works(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_numba_everything_still_works(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from factorgrasp.solvers import kernels
 
     monkeypatch.setattr(kernels, "load", lambda seconds=0.0: None)

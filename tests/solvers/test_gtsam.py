@@ -388,6 +388,24 @@ def test_isam2_is_fed_in_increments_that_hold_the_whole_graph() -> None:
     assert sum(values.size() for _, values in parts) == view.values.size()
 
 
+def test_isam2_begins_again_with_the_whole_graph(monkeypatch: pytest.MonkeyPatch) -> None:
+    original, fed = GtsamIsam2._feed, []
+
+    def feed(self: GtsamIsam2, view: NonlinearView, run: Any, parts: list[Any]) -> Any:
+        fed.append(len(parts))
+        values = original(self, view, run, parts)
+        if len(parts) > 1:
+            run.end(Status.NOT_CONVERGED, "led away")
+        return values
+
+    monkeypatch.setattr(GtsamIsam2, "_feed", feed)
+    found = GtsamIsam2(SolverOptions(extra={"increments": 3})).solve_problem(Chain())
+    assert found.status is Status.SOLVED
+    assert "fed whole" in found.message
+    assert fed[0] > 1
+    assert fed[1:] == [1]
+
+
 def test_custom_factor_jacobians_against_gtsam_differences() -> None:
     problem = Chain()
     view = NonlinearView(problem, problem.initial_state())

@@ -113,10 +113,18 @@ def test_robust_line_fit_matches_scipy(loss: Loss, name: str, rng: np.random.Gen
     A = np.column_stack([t, np.ones_like(t)])
     b = A @ [2.0, -1.0] + 0.1 * rng.normal(size=80)
     b[::9] += rng.normal(2.0, 1.0, size=b[::9].size)
-    problem = LeastSquares([Variable("line", 2)], [Term("points", 80, ("line",), Covariance.scalar(0.01), loss, group=1)])
+    problem = LeastSquares(
+        [Variable("line", 2)], [Term("points", 80, ("line",), Covariance.scalar(0.01), loss, group=1)]
+    )
     problem.set_term("points", {"line": A}, b)
     theirs = least_squares(
-        lambda x: (A @ x - b) / 0.1, lstsq(A, b), loss=name, f_scale=loss.scale, xtol=1e-15, ftol=1e-15, gtol=1e-12
+        lambda x: (A @ x - b) / 0.1,
+        lstsq(A, b),
+        loss=name,
+        f_scale=loss.scale,
+        xtol=1e-15,
+        ftol=1e-15,
+        gtol=1e-12,
     )
     estimate = solve(problem)
     assert estimate.status is Status.SOLVED
@@ -147,7 +155,9 @@ def test_robust_fit_under_inequalities_matches_scipy(rng: np.random.Generator) -
     problem = LeastSquares([Variable("x", 3)], [Term("rows", 40, ("x",), loss=Huber(1.0), group=1)])
     problem.set_term("rows", {"x": A}, b)
     problem.set_bounds("x", -0.1, 0.1)
-    theirs = least_squares(lambda x: A @ x - b, np.zeros(3), bounds=(-0.1, 0.1), loss="huber", xtol=1e-15, ftol=1e-15)
+    theirs = least_squares(
+        lambda x: A @ x - b, np.zeros(3), bounds=(-0.1, 0.1), loss="huber", xtol=1e-15, ftol=1e-15
+    )
     np.testing.assert_allclose(solve(problem).values["x"], theirs.x, atol=1e-6)
 
 
@@ -252,7 +262,10 @@ def test_nonlinear_equality_matches_scipy() -> None:
         return np.array([x[0] ** 2 / 4.0 + x[1] ** 2 - 1.0])
 
     theirs = minimize(
-        lambda x: 0.5 * np.sum((x - target) ** 2), [1.0, 1.0], constraints={"type": "eq", "fun": ring}, tol=1e-14
+        lambda x: 0.5 * np.sum((x - target) ** 2),
+        [1.0, 1.0],
+        constraints={"type": "eq", "fun": ring},
+        tol=1e-14,
     )
     curve = Curve(
         np.array([1.0, 1.0]), lambda x: x - target, lambda x: np.eye(2),
@@ -323,7 +336,9 @@ def test_a_wrong_jacobian_is_a_stall_not_a_solution() -> None:
 
 
 def test_a_direction_without_information_is_left_alone_and_named() -> None:
-    curve = Curve(np.array([2.0, 5.0]), lambda x: np.array([x[0] ** 2 - 1.0]), lambda x: np.array([[2.0 * x[0], 0.0]]))
+    curve = Curve(
+        np.array([2.0, 5.0]), lambda x: np.array([x[0] ** 2 - 1.0]), lambda x: np.array([[2.0 * x[0], 0.0]])
+    )
     for solver in ("cholesky", "gtsam", "piqp"):
         estimate = solve(curve, solver)
         assert estimate.status is Status.UNOBSERVABLE, solver
@@ -360,10 +375,14 @@ def test_damping_adds_its_rows_and_nothing_else(rng: np.random.Generator) -> Non
     assert weights is not None
     plain, vector = problem.normal_equations(weights[:8])
     information, damped_vector = damped.problem.normal_equations(weights)
-    np.testing.assert_allclose(information.toarray(), plain.toarray() + 0.5 * np.diag(plain.diagonal()), atol=1e-12)
+    np.testing.assert_allclose(
+        information.toarray(), plain.toarray() + 0.5 * np.diag(plain.diagonal()), atol=1e-12
+    )
     np.testing.assert_allclose(damped_vector, vector, atol=1e-12)
     np.testing.assert_array_equal(damped.problem.lower, problem.lower)
-    np.testing.assert_array_equal(damped.problem.equalities.matrix.toarray(), problem.equalities.matrix.toarray())
+    np.testing.assert_array_equal(
+        damped.problem.equalities.matrix.toarray(), problem.equalities.matrix.toarray()
+    )
 
 
 def test_levenberg_marquardt_from_the_start_reaches_the_same_optimum() -> None:

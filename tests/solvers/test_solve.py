@@ -24,7 +24,9 @@ from factorgrasp.variables import Variable
 def make(rng: np.random.Generator, equality: bool = False, inequality: bool = False) -> LeastSquares:
     constraints = [Constraint("sum", 1, ("x",))] if equality else []
     constraints += [Constraint("cap", 2, ("x",), "inequality", unit="N")] if inequality else []
-    problem = LeastSquares([Variable("x", 3, unit="m", resolution=10.0)], [Term("rows", 6, ("x",))], constraints)
+    problem = LeastSquares(
+        [Variable("x", 3, unit="m", resolution=10.0)], [Term("rows", 6, ("x",))], constraints
+    )
     problem.set_term("rows", {"x": rng.normal(size=(6, 3))}, rng.normal(size=6))
     if equality:
         problem.set_constraint("sum", {"x": np.ones((1, 3))}, 1.0)
@@ -64,14 +66,18 @@ def test_every_registered_solver_loads_and_declares_itself() -> None:
 
 
 def test_an_unknown_solver_lists_the_known_ones() -> None:
-    with pytest.raises(SolverError, match=r"unknown solver 'chol'. Installed: cholesky, kkt.*pip install") as caught:
+    with pytest.raises(
+        SolverError, match=r"unknown solver 'chol'. Installed: cholesky, kkt.*pip install"
+    ) as caught:
         registry.get_solver("chol")
     assert "osqp" in str(caught.value)
 
 
 def test_a_missing_solver_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Cholesky, "modules", ("no_such_module",))
-    with pytest.raises(SolverError, match=r"'cholesky' is not installed: pip install qdldl\. Installed: .*gtsam"):
+    with pytest.raises(
+        SolverError, match=r"'cholesky' is not installed: pip install qdldl\. Installed: .*gtsam"
+    ):
         registry.get_solver("cholesky")
 
 
