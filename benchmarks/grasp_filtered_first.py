@@ -46,7 +46,9 @@ def estimate(
         if last - first < 4 * margin:
             continue
         rows = slice(first, last)
-        p, q, readings = (filtfilt(b, a, x[rows], axis=0) for x in (robot.position, robot.rotation_wxyz, both))
+        p, q, readings = (
+            filtfilt(b, a, x[rows], axis=0) for x in (robot.position, robot.rotation_wxyz, both)
+        )
         q = q / np.linalg.norm(q, axis=1, keepdims=True)
         # The signals are smooth by now: the shortest window that gives second derivatives adds no smoothing worth mentioning.
         motion = signals.differentiate_rotations(q, step, 5, 4)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from factorgrasp.tables import Column, Table, plain
@@ -54,6 +54,12 @@ class Metric:
         if self.target is None:
             return None
         return bool(self.value <= self.target if self.direction == "lower" else self.value >= self.target)
+
+    def without_target(self, note: str) -> Metric:
+        """The same as information only, with a note why."""
+        return replace(
+            self, direction="none", target=None, note=f"{note}; {self.note}" if self.note else note
+        )
 
     @property
     def target_words(self) -> str:

@@ -126,6 +126,12 @@ class GraspPoseEstimate:
         if diagnostics.clock_correlation < SMALLEST_CORRELATION:
             words = grasp_words.unrelated(diagnostics.clock_correlation, diagnostics.rate_moment)
             estimate = replace(estimate, status=Status.UNOBSERVABLE, message=words)
+        elif "accelerometer_bias" in names:
+            words = grasp_words.contradiction(
+                values["accelerometer_bias"], problem.noise.accelerometer_bias_sd
+            )
+            if words:
+                estimate = replace(estimate, status=Status.NOT_CONVERGED, message=words)
 
         def bias(name: str) -> tuple[FloatArray, FloatArray]:
             if name not in names:

@@ -7,33 +7,29 @@ every sample of the slower stream; unknown are the grasp, the other world and th
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass, fields
-from typing import Literal
 
 import numpy as np
 
 from factorgrasp import lie
-from factorgrasp.errors import InputError
+from factorgrasp.errors import InputError, UnobservableError
 from factorgrasp.estimate import Estimate
 from factorgrasp.least_squares import LeastSquares, Term
-from factorgrasp.losses import LOSSES, Loss, make_loss
 from factorgrasp.problems.cluster_scores import (
     cluster_score_covariance,
     drowned_directions,
     without_noise_information,
 )
 from factorgrasp.problems.grasp_from_poses_estimate import GraspFromPosesDiagnostics, GraspFromPosesEstimate
+from factorgrasp.problems.grasp_from_poses_settings import (
+    FEWEST_CLUSTERS,
+    GraspFromPosesNoise,
+    GraspFromPosesSettings,
+)
 from factorgrasp.problems.grasp_settings import GraspPrior
 from factorgrasp.problems.grasp_words import axis_words
-from factorgrasp.problems.hand_eye_math import (
-    COLUMNS,
-    ClockMatch,
-    PoseCoupling,
-    coupling_rows,
-    match_clocks,
-    noise_information,
-    start_state,
-)
+from factorgrasp.problems.hand_eye_math import COLUMNS, PoseCoupling, coupling_rows, noise_information
+from factorgrasp.problems.hand_eye_start import ClockMatch, match_clocks, start_state
+from factorgrasp.problems.held_directions import HELD_TERM, HeldDirections, fill_held, held_term
 from factorgrasp.recordings import PoseStream
 from factorgrasp.typing import FloatArray, IntArray, State
 from factorgrasp.uncertainty import Covariance
@@ -41,103 +37,13 @@ from factorgrasp.variables import Variable, retract, slices
 
 # Below this the two sides do not move alike at any offset, and the clocks are left as they are.
 SMALLEST_CORRELATION = 0.5
-# A norm of six components instead of one: sqrt(chi2) at 95 % for 6 over that for 1 degree of freedom, which keeps a loss's efficiency.
-_LOSS_STRETCH = 3.548 / 1.345
 # Median of chi2 with three degrees of freedom.
 _MEDIAN_CHI2_3 = 2.366
 _SETTLED_NOISE = 0.02
 _FEWEST_SAMPLES = 20
-_FEWEST_CLUSTERS = 4
 # 1 - |mean rotation| along an axis: 1e-4 is a rotation of about 1 deg rms.
 _HARDLY_ROTATES = 1e-4
 _ONE_AXIS = 0.02
-_HELD = "directions without information"
-# In posterior standard deviations of what noise pretends.
-_HELD_SD = 0.03
-
-
-@dataclass(frozen=True)
-class GraspFromPosesNoise:
-    """Noise of one comparison of both poses; starting values when `adapt_noise` is on.
-
-    Attributes
-    ----------
-    rotation_sd, position_sd : float
-        Of each component, both sides and the way between samples together, rad and m.
-    time_offset_sd : float
-        Prior of the time offset that remains after the coarse search, s.
-    """
-
-    rotation_sd: float = 0.01
-    position_sd: float = 0.005
-    time_offset_sd: float = 0.1
-
-    def __post_init__(self) -> None:
-        for item in fields(self):
-            _above_zero(f"noise.{item.name}", getattr(self, item.name))
-
-
-@dataclass(frozen=True)
-class GraspFromPosesSettings:
-    """What is estimated, and how the recordings are read.
-
-    Attributes
-    ----------
-    time_offset : bool
-        Estimate the offset between the two clocks (hand minus robot).
-    time_offset_guess : float
-        s; middle of the coarse search, or the known offset when `time_offset` is off.
-    max_time_offset : float
-        s; half width of the coarse search.
-    adapt_noise : {"isotropic", "full", "none"}
-        "isotropic": a variance of the rotation and one of the position, from the median residual. "full": a covariance (6, 6) in the
-        hand frame, which knows that a camera's error in rotation and the one in position go together; far more precise when the errors are
-        noise, but it trusts small systematic ones, too. "none": as declared.
-    loss : {"huber", "cauchy", "geman_mcclure", "none"}
-        On the whitened norm of each comparison (six components).
-    loss_scale : float or None
-        In standard deviations of that norm; None: the loss's default, stretched for six components (3.55 for Huber).
-    clusters : int
-        Number of stretches of the recording whose scores tell the covariance: residuals of different stretches count as independent,
-        within a stretch anything is allowed. 0 trusts every sample to be independent.
-    max_gap : float or None
-        s; samples further apart are a gap, which is never bridged. None: by the regularity of the stamps.
-    rotation_resolution, translation_resolution : float
-        rad and m; a direction whose posterior sd is larger counts as not identified.
-    """
-
-    time_offset: bool = True
-    time_offset_guess: float = 0.0
-    max_time_offset: float = 1.0
-    adapt_noise: Literal["isotropic", "full", "none"] = "isotropic"
-    loss: Literal["huber", "cauchy", "geman_mcclure", "none"] = "huber"
-    loss_scale: float | None = None
-    clusters: int = 12
-    max_gap: float | None = None
-    rotation_resolution: float = 0.05
-    translation_resolution: float = 0.03
-
-    def __post_init__(self) -> None:
-        make_loss(self.loss, self.loss_scale)
-        if self.adapt_noise not in ("isotropic", "full", "none"):
-            raise InputError("estimate.adapt_noise", "one of isotropic, full, none", repr(self.adapt_noise))
-        for name in ("max_time_offset", "rotation_resolution", "translation_resolution"):
-            _above_zero(f"estimate.{name}", getattr(self, name))
-        if self.max_gap is not None:
-            _above_zero("estimate.max_gap", self.max_gap)
-        if not np.isfinite(self.time_offset_guess):
-            raise InputError(
-                "estimate.time_offset_guess", "a finite number of seconds", repr(self.time_offset_guess)
-            )
-        if self.clusters != 0 and self.clusters < _FEWEST_CLUSTERS:
-            raise InputError("estimate.clusters", f"0, or at least {_FEWEST_CLUSTERS}", repr(self.clusters))
-
-    def make_loss(self) -> Loss | None:
-        """The loss at its scale for six components."""
-        if self.loss == "none":
-            return None
-        default = LOSSES[self.loss]().scale * _LOSS_STRETCH
-        return make_loss(self.loss, default if self.loss_scale is None else self.loss_scale)
 
 
 class GraspPoseFromPoses:
@@ -157,6 +63,8 @@ class GraspPoseFromPoses:
     ------
     InputError
         Naming the field, for streams of another kind, that do not overlap or are too short.
+    UnobservableError
+        When the robot does not move at all.
     """
 
     kind = "grasp_pose_from_poses"
@@ -184,10 +92,11 @@ class GraspPoseFromPoses:
         self.variables = _variables(self.settings)
         self._columns = slices(self.variables)
         self._loss = self.settings.make_loss()
+        self._require_motion()
         self.clock = self._match_clocks()
         self._covariance = np.diag(np.repeat([self.noise.rotation_sd**2, self.noise.position_sd**2], 3))
         self._start: State | None = None
-        self._held: _Held | None = None
+        self._held: HeldDirections | None = None
         self._system: LeastSquares | None = None
         self._select(self.clock.offset)
 
@@ -205,8 +114,10 @@ class GraspPoseFromPoses:
     def linearize(self, state: State) -> LeastSquares:
         """Six rows a sample, [rotation; position] in the hand frame, and one row a component with a prior."""
         if self._system is None:
-            held = [] if self._held is None else [_held_term(self._held, self.variables)]
+            held = [] if self._held is None else [held_term(self._held, self.variables)]
             self._system = LeastSquares(self.variables, [*self._terms(), *held])
+        # Refined problems share the system, but not the covariance.
+        self._system.set_covariance("pose", Covariance.blocks(self._covariance))
         self._fill(self._system, state)
         return self._system
 
@@ -227,8 +138,6 @@ class GraspPoseFromPoses:
         fresh._covariance, fresh._start = covariance, dict(state)
         if moved:
             fresh._select(offset)
-        elif fresh._system is not None:
-            fresh._system.set_covariance("pose", Covariance.blocks(covariance))
         return fresh
 
     def score_covariance(self, state: State) -> FloatArray:
@@ -245,13 +154,13 @@ class GraspPoseFromPoses:
         prior = other_rows.T @ other_rows
         information = rows.T @ rows + prior
         cluster = self._clusters()
-        if self.settings.clusters == 0 or np.unique(cluster).size < _FEWEST_CLUSTERS:
+        if self.settings.clusters == 0 or np.unique(cluster).size < FEWEST_CLUSTERS:
             score = information
         else:
             score = cluster_score_covariance(rows, rhs[where], np.repeat(cluster, 6), prior)
         noise = self._noise_information(state, weights)
         if self._held is not None:
-            held = matrix[system.jacobian.slices[_HELD]].toarray()
+            held = matrix[system.jacobian.slices[HELD_TERM]].toarray()
             noise = noise + held.T @ held
         return without_noise_information(score, information, self._known_beforehand(), noise)
 
@@ -327,6 +236,16 @@ class GraspPoseFromPoses:
 
     # ---- internals -------------------------------------------------------------------------------------------
 
+    def _require_motion(self) -> None:
+        robot = self._coupling.robot
+        turn, way = robot.noise[0]
+        travel = float(np.linalg.norm(robot.position.std(axis=0)))
+        if self._rotation_spread()[0][2] <= 6.0 * turn**2 + 1e-9 and travel <= 3.0 * way + 1e-5:
+            raise UnobservableError(
+                "the robot stands still, which shows nothing of the grasp: move and rotate the object, by some tens of degrees about at "
+                "least two axes"
+            )
+
     def _match_clocks(self) -> ClockMatch:
         guess = self.settings.time_offset_guess
         # Without a search the correlation at the guess still tells whether the two sides moved together at all.
@@ -377,7 +296,7 @@ class GraspPoseFromPoses:
             squares = (residual.reshape(-1, 2, 3) ** 2).sum(axis=2)
             # Noise-free recordings still need a covariance: a micrometre and a microradian.
             variances = np.maximum(freedom * np.median(squares, axis=0) / _MEDIAN_CHI2_3, 1e-12)
-            return np.diag(np.repeat(variances, 3))
+            return np.asarray(np.diag(np.repeat(variances, 3)))
         weight = np.ones(len(residual)) if self._loss is None else self._loss.weight(self._norms(residual))
         covariance = freedom * (residual * weight[:, None]).T @ residual / weight.sum()
         return np.asarray(0.5 * (covariance + covariance.T) + 1e-12 * np.eye(6))
@@ -391,7 +310,7 @@ class GraspPoseFromPoses:
         poses = self._coupling.at(self._samples, float(state["time_offset"][0]))
         out = noise_information(state, poses, self._coupling.robot.noise, self._coupling.hand.noise, whitener)
         columns = np.concatenate([np.arange(13)[COLUMNS[variable.name]] for variable in self.variables])
-        return out[np.ix_(columns, columns)]
+        return np.asarray(out[np.ix_(columns, columns)])
 
     def _known_beforehand(self) -> FloatArray:
         """Information (n, n) of the priors, and of what goes without saying: a rotation is within pi, the other world within 100 m."""
@@ -405,7 +324,7 @@ class GraspPoseFromPoses:
             out[self._columns[name]] += 1.0 / sd**2
         return np.diag(out)
 
-    def _hold(self, state: State) -> _Held | None:
+    def _hold(self, state: State) -> HeldDirections | None:
         """The start, to be kept along directions that only noise seems to inform: a search along them would never end."""
         system = LeastSquares(self.variables, self._terms())
         self._fill(system, state)
@@ -413,7 +332,7 @@ class GraspPoseFromPoses:
         information = system.normal_equations(weights)[0].toarray()
         noise = self._noise_information(state, weights)
         rows = drowned_directions(information, self._known_beforehand(), noise)
-        return _Held(dict(state), rows) if len(rows) else None
+        return HeldDirections(dict(state), rows) if len(rows) else None
 
     def _clusters(self) -> IntArray:
         """Stretch of equal duration that each sample belongs to."""
@@ -449,9 +368,9 @@ class GraspPoseFromPoses:
         for name in self._priors():
             slope, error = self._prior_error(name, state)
             system.set_term(f"prior of {name}", {name: slope}, -error)
-        if _HELD in system.terms:
+        if HELD_TERM in system.terms:
             assert self._held is not None
-            _fill_held(system, self._held, state)
+            fill_held(system, self._held, state)
 
     def _priors(self) -> dict[str, float]:
         out = {"translation": self.prior.translation_sd}
@@ -471,33 +390,6 @@ class GraspPoseFromPoses:
         return np.eye(error.size), error
 
 
-@dataclass(frozen=True)
-class _Held:
-    """Directions (k, n) of the tangent space along which the state stays where it was."""
-
-    state: State
-    rows: FloatArray
-
-
-def _held_term(held: _Held, variables: tuple[Variable, ...]) -> Term:
-    names = tuple(variable.name for variable in variables)
-    return Term(_HELD, len(held.rows), names, Covariance.scalar(_HELD_SD**2), unit="")
-
-
-def _fill_held(system: LeastSquares, held: _Held, state: State) -> None:
-    """Rows that pull the state back to where it is held."""
-    blocks, total = {}, np.zeros(len(held.rows))
-    for variable in system.variables:
-        way = variable.local(held.state[variable.name], state[variable.name])
-        slope = (
-            lie.so3_right_jacobian_inverse(way) if variable.manifold == "rotation" else np.eye(variable.size)
-        )
-        part = held.rows[:, system.columns[variable.name]]
-        blocks[variable.name] = part @ slope
-        total += part @ way
-    system.set_term(_HELD, blocks, -total)
-
-
 def _variables(settings: GraspFromPosesSettings) -> tuple[Variable, ...]:
     def components(words: str) -> tuple[str, ...]:
         return tuple(f"{words} {axis}" for axis in "xyz")
@@ -513,16 +405,6 @@ def _variables(settings: GraspFromPosesSettings) -> tuple[Variable, ...]:
     if settings.time_offset:
         out.append(Variable("time_offset", 1, unit="s", components=("time offset",)))
     return tuple(out)
-
-
-def _above_zero(field: str, value: object) -> None:
-    if (
-        isinstance(value, bool)
-        or not isinstance(value, (int, float))
-        or not np.isfinite(value)
-        or value <= 0.0
-    ):
-        raise InputError(field, "a finite number above zero", repr(value))
 
 
 __all__ = ["GraspFromPosesNoise", "GraspFromPosesSettings", "GraspPoseFromPoses"]

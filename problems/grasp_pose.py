@@ -22,7 +22,7 @@ from factorgrasp.observability import default_words
 from factorgrasp.problems import grasp_words
 from factorgrasp.problems.grasp_estimate import GraspDiagnostics, GraspPoseEstimate
 from factorgrasp.problems.grasp_global import better_rotation, rotation_cost
-from factorgrasp.problems.grasp_kinematics import RobotStream, gap_limit, robot_kinematics
+from factorgrasp.problems.grasp_kinematics import RobotKinematics, RobotStream, gap_limit, robot_kinematics
 from factorgrasp.problems.grasp_model import GraspModel, phi_information, quadratic_forms
 from factorgrasp.problems.grasp_model_check import ModelCheck, check_model
 from factorgrasp.problems.grasp_noise import (
@@ -34,11 +34,11 @@ from factorgrasp.problems.grasp_noise import (
 )
 from factorgrasp.problems.grasp_recording import (
     SMALLEST_CORRELATION,
-    ClockSearch,
     CoupledWindows,
+    CouplingGrid,
     HandSignals,
     coupling_grid,
-    search_time_offset,
+    find_clock,
     tilt_axes,
     used_samples,
 )
@@ -68,7 +68,9 @@ SETTLED_OFFSET = 1e-4
 SETTLED_WEIGHTS = 0.02
 SETTLED_STEP = 0.02
 SETTLED_ROBUST_STEP = 0.1
-MOST_RATE_RATIO = 20.0
+# Where fewer windows than this are free of gaps, shorter ones are tried, down to this length (s).
+ENOUGH_COVERED = 0.5
+SHORTEST_WINDOW = 0.1
 
 
 @dataclass(frozen=True)
@@ -143,9 +145,9 @@ class GraspPose:
         )
         self.kinematics_bandwidth = motion.bandwidth
         self._hand = HandSignals.from_stream(hand, self.settings.max_gap)
-        self.clock = self._search_clock(motion)
+        self.clock = find_clock(motion, self._hand, self.settings, bandwidth)
         tilt = tilt_axes(self.gravity) if self.settings.base_tilt else None
-        self._grid = coupling_grid(motion, hand.rate, bandwidth, self.settings.window, tilt)
+        self._grid, self._windows = self._window(motion, hand.rate, tilt)
         # Where the two sides do not turn together, clocks and sensor errors would only chase noise.
         hopeless = (
             frozenset((*SENSOR_ERRORS, "time_offset"))
@@ -153,7 +155,6 @@ class GraspPose:
             else frozenset()
         )
         self.model = GraspModel(*grasp_variables(self.noise, self.settings, hopeless))
-        self._windows = self._couple(self.clock.offset)
         self._expected: NoiseMoments = noise_moments(
             motion.noise(self._grid.windowing.frequencies),
             self.noise,
@@ -171,6 +172,7 @@ class GraspPose:
         self._start: State | None = None
         self._trust: FloatArray | None = None
         self._pruned = False
+        self._checked: ModelCheck | None = None
 
     # ---- the protocol of a nonlinear problem
     # -----------------------------------------------------------------
@@ -283,11 +285,10 @@ class GraspPose:
             known = np.linalg.inv(np.diag(prior_precision(self.model, self.noise, self.prior)))
             return np.asarray(H @ known @ H)
         meat = self._model_meat(state)
-        return (
-            meat
-            if not self.settings.check_model
-            else self.check(state).widened(self._information(state), meat)
-        )
+        if not self.settings.check_model:
+            return meat
+        self._checked = self.check(state)
+        return self._checked.widened(self._information(state), meat)
 
     def check(self, state: State) -> ModelCheck:
         """Test whether stretches, frequency bands and both sides tell the same story."""
@@ -313,7 +314,7 @@ class GraspPose:
     @property
     def advice(self) -> str:
         """What would inform the directions that are missing."""
-        return grasp_words.advice(self._grid.rate_moment, self._streams[0])
+        return grasp_words.advice(self._grid.rate_moment, self._checked)
 
     def view(self, estimate: Estimate) -> GraspPoseEstimate:
         """The typed view, with the whole time offset and the data that reports draw."""
@@ -421,39 +422,33 @@ class GraspPose:
         state["translation"] = self.prior.translation.copy()
         return state
 
-    def _search_clock(self, motion: Any) -> ClockSearch:
-        guess = self.settings.time_offset_guess
-        # Without a search the correlation at the guess is still wanted: it tells whether the two sides moved
-        # together at all.
-        reach = self.settings.max_time_offset if self.settings.time_offset else 1e-9
-        found = search_time_offset(motion, self._hand, guess, reach, self.bandwidth)
-        if not self.settings.time_offset or found.correlation < SMALLEST_CORRELATION:
-            found = ClockSearch(guess, found.correlation, found.ambiguity)
-        robot_speed, hand_speed = _rms(motion.angular_velocity), _rms(self._hand.angular_velocity)
-        ratio = hand_speed / robot_speed if robot_speed > 0.0 else 1.0
-        if found.correlation > SMALLEST_CORRELATION and (
-            ratio > MOST_RATE_RATIO or ratio < 1.0 / MOST_RATE_RATIO
-        ):
-            side = "hand" if ratio > 1.0 else "robot"
-            raise InputError(
-                f"{side} angular velocity",
-                "rad/s on both sides, which move as one body",
-                f"{hand_speed:.4g} (hand) against {robot_speed:.4g} (robot), a factor of {max(ratio, 1 / ratio):.1f}; "
-                "180/pi = 57.3: degrees suspected",
-                "Declare [deg/s] in the file's header or convert to rad/s",
-            )
-        return found
+    def _window(
+        self, motion: RobotKinematics, hand_rate: float, tilt: FloatArray | None
+    ) -> tuple[CouplingGrid, CoupledWindows]:
+        """Windows of the wanted length, or shorter ones where gaps are so dense that they touch most of them."""
+        seconds, best = self.settings.window, -1.0
+        while best < ENOUGH_COVERED and (best < 0.0 or seconds >= SHORTEST_WINDOW):
+            grid = coupling_grid(motion, hand_rate, self.bandwidth, seconds, tilt)
+            windows = grid.couple(self._hand, self.clock.offset)
+            covered = windows.t.size / max(windows.t.size + windows.dropped, 1)
+            if covered > best:
+                best, chosen = covered, (grid, windows)
+            seconds *= 0.5
+        return chosen[0], self._enough(*chosen, self.clock.offset)
 
     def _couple(self, offset: float) -> CoupledWindows:
-        windows = self._grid.couple(self._hand, offset)
+        return self._enough(self._grid, self._grid.couple(self._hand, offset), offset)
+
+    def _enough(self, grid: CouplingGrid, windows: CoupledWindows, offset: float) -> CoupledWindows:
         if windows.t.size < 2:
             robot, hand = self._streams
+            seconds = grid.windowing.length * grid.windowing.step
             raise InputError(
                 "robot and hand",
-                f"at least two common windows of {self._grid.windowing.length * self._grid.windowing.step:.3g} s without gaps",
-                f"{windows.t.size} (robot {robot.t[0]:.6g} to {robot.t[-1]:.6g} s, hand {hand.t[0]:.6g} to {hand.t[-1]:.6g} s, "
-                f"offset {offset:.4g} s, {windows.dropped} windows with gaps)",
-                "Record longer, or shorten estimate.window",
+                f"at least two common windows of {seconds:.3g} s without gaps",
+                f"{windows.t.size} (robot {robot.t[0]:.6g} to {robot.t[-1]:.6g} s, hand {hand.t[0]:.6g} to "
+                f"{hand.t[-1]:.6g} s, offset {offset:.4g} s, {windows.dropped} windows with gaps)",
+                "Record longer, or with fewer gaps",
             )
         return windows
 
@@ -511,12 +506,6 @@ class GraspPose:
 def _projected(Z: FloatArray) -> FloatArray:
     root = positive_part(Z)
     return np.asarray(root @ root.T)
-
-
-def _rms(x: FloatArray) -> float:
-    rows = x[:: max(1, x.shape[0] // 5000)]
-    rows = rows[np.isfinite(rows).all(axis=1)]
-    return float(np.sqrt(np.mean(np.sum((rows - rows.mean(axis=0)) ** 2, axis=1)))) if rows.size else 0.0
 
 
 def _checked_gravity(gravity: Sequence[float] | FloatArray) -> FloatArray:

@@ -10,12 +10,15 @@ from factorgrasp import signals
 from factorgrasp.errors import InputError
 from factorgrasp.problems.grasp_kinematics import RobotKinematics, gap_limit, uniform_grid
 from factorgrasp.problems.grasp_model import VECH
+from factorgrasp.problems.grasp_settings import GraspSettings
 from factorgrasp.problems.grasp_windows import Windowing, finite_windows
 from factorgrasp.recordings import ImuStream
 from factorgrasp.typing import BoolArray, FloatArray
 
 # Below this the two angular rates are not the same motion at any offset.
 SMALLEST_CORRELATION = 0.5
+# Gyroscopes are off by a few per cent; a larger factor between the rates of one body is a wrong unit.
+_LARGEST_GAIN = 1.3
 # Steps by which two uniform clocks may drift apart over a recording and still be called the same grid.
 _DRIFT = 1e-3
 # Samples a second that z keeps for every Hz of bandwidth; enough that vibration does not fold into the band.
@@ -226,11 +229,14 @@ class ClockSearch:
         Of the two angular rates at it, rotation and bias removed, 0 to 1.
     ambiguity : float
         Second highest peak over the highest, 0 to 1.
+    gain : float
+        Rate of the hand per rate of the robot, best rotation removed: 1 for one body in the same unit.
     """
 
     offset: float
     correlation: float
     ambiguity: float
+    gain: float = 1.0
 
 
 def search_time_offset(
@@ -271,18 +277,47 @@ def search_time_offset(
         # One side does not rotate at all: no offset can be found, and none matters.
         return ClockSearch(guess, 0.0, 1.0)
     found = _best_peak(lags, np.nan_to_num(correlations, nan=-1.0), guess, step)
-    if reach < step or found.correlation < SMALLEST_CORRELATION:
+    if found.correlation < SMALLEST_CORRELATION:
         return found
-    return _sharpened(found, grid, x, hand, step)
+    return _sharpened(found, grid, x, hand, min(step, reach))
+
+
+def find_clock(
+    robot: RobotKinematics, hand: HandSignals, settings: GraspSettings, bandwidth: float
+) -> ClockSearch:
+    """Coarse time offset as the settings ask for it; the guess where there is no common motion to find one by.
+
+    Raises
+    ------
+    InputError
+        When the two sides turn together, but one of them faster than a sensor's error explains.
+    """
+    guess = settings.time_offset_guess
+    # Without a search the correlation at the guess is still wanted: it tells whether the two sides moved together at all.
+    reach = settings.max_time_offset if settings.time_offset else 1e-9
+    found = search_time_offset(robot, hand, guess, reach, bandwidth)
+    if not settings.time_offset or found.correlation < SMALLEST_CORRELATION:
+        found = ClockSearch(guess, found.correlation, found.ambiguity, found.gain)
+    if found.correlation > SMALLEST_CORRELATION and not 1.0 / _LARGEST_GAIN < found.gain < _LARGEST_GAIN:
+        side, factor = ("hand", found.gain) if found.gain > 1.0 else ("robot", 1.0 / found.gain)
+        suspicion = " (180/pi = 57.3: degrees suspected)" if 45.0 < factor < 70.0 else ""
+        raise InputError(
+            f"{side} angular velocity",
+            "rad/s on both sides, which turn as one body",
+            f"rates that are {factor:.3g} times those of the other side{suspicion}",
+            "Declare the unit in the file's header, e.g. wx [deg/s], or mend the sensor's scale",
+        )
+    return found
 
 
 def _sharpened(
-    found: ClockSearch, grid: FloatArray, x: FloatArray, hand: HandSignals, step: float
+    found: ClockSearch, grid: FloatArray, x: FloatArray, hand: HandSignals, most: float
 ) -> ClockSearch:
     """One Gauss-Newton step on the offset with rotation and bias held.
 
     The parabola through the correlation's peak is a few tenths of a step off.
     """
+    step = float(grid[1] - grid[0])
     y = signals.resample_uniform(
         hand.t, hand.angular_velocity, grid + found.offset, max_gap=max(hand.limit, 1.1 * step), kind="cubic"
     )[1]
@@ -296,7 +331,10 @@ def _sharpened(
     R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
     turned = d @ R.T
     shift = float(np.sum(turned * (a - b @ R.T)) / max(np.sum(turned**2), 1e-300))
-    return ClockSearch(found.offset + float(np.clip(shift, -step, step)), found.correlation, found.ambiguity)
+    gain = float(np.sum(a * (b @ R.T)) / max(np.sum(a**2), 1e-300))
+    return ClockSearch(
+        found.offset + float(np.clip(shift, -most, most)), found.correlation, found.ambiguity, gain
+    )
 
 
 def _rotation_invariant_correlation(x: FloatArray, y: FloatArray) -> FloatArray:
@@ -360,6 +398,7 @@ __all__ = [
     "CouplingGrid",
     "HandSignals",
     "coupling_grid",
+    "find_clock",
     "search_time_offset",
     "shifted_rows",
     "tilt_axes",

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from factorgrasp.problems.grasp_model import GYRO_WIDTH, GraspModel, quadratic_forms
+from factorgrasp.problems.grasp_model import GraspModel, quadratic_forms
 from factorgrasp.typing import FloatArray, State
 
 # Curvature below this part of the largest (in scaled unknowns) is rounding.
@@ -103,34 +103,32 @@ class SegmentFactor:
 
     def quadratic(self, state: State) -> Quadratic:
         """Second-order model of the cost at a state with the names of the grasp model."""
-        if self._slip_rate_variance > 0.0:
-            return self._slipping(state)[0]
-        moments, model = self.moments, self.model
-        (L_g, L_a), (J_g, J_a) = model.matrices(state), model.jacobians(state)
+        moments = self.moments
+        L_g, L_a, J_g, J_a, slip = self._residuals(state)
         c_g, g_g, H_g = quadratic_forms(L_g, J_g, moments.gyro)
         c_a, g_a, H_a = quadratic_forms(L_a, J_a, moments.accelerometer)
-        return Quadratic(c_g + c_a, g_g + g_a, H_g + H_a)
+        value, gradient, matrix = c_g + c_a, g_g + g_a, H_g + H_a
+        if slip is not None:
+            value += 0.5 * float(slip.rate @ slip.rate) / self._slip_rate_variance
+            matrix = matrix - slip.cross @ slip.covariance @ slip.cross.T
+        return Quadratic(value, gradient, matrix)
 
     def score_covariance(self, state: State) -> FloatArray:
         """Covariance (n, n) of the gradient, from the noise of measurement and from the slip."""
-        moments, model = self.moments, self.model
-        gain = None
-        if self._slip_rate_variance > 0.0:
-            _, state, gain, _ = self._slipping(state)
-        (L_g, L_a), (J_g, J_a) = model.matrices(state), model.jacobians(state)
-        if gain is not None:
-            J_g = np.concatenate([J_g, _slip_jacobian(model, state)])
+        moments = self.moments
+        L_g, L_a, J_g, J_a, slip = self._residuals(state)
         meat = quadratic_forms(L_g, J_g, moments.gyro_score)[2]
-        if gain is not None:
-            meat[-3:, -3:] += np.eye(3) / self._slip_rate_variance
-            lift = np.hstack([np.eye(model.size), -gain])
-            meat = lift @ meat @ lift.T
+        if slip is not None:
+            gain = slip.cross @ slip.covariance
+            cross = _cross(J_g, moments.gyro_score, slip.gain) @ gain.T
+            own = slip.gain.T @ slip.gain * moments.gyro_score[9, 9] + np.eye(3) / self._slip_rate_variance
+            meat = meat - cross - cross.T + gain @ own @ gain.T
         return np.asarray(meat + quadratic_forms(L_a, J_a, moments.accelerometer_score)[2])
 
     def band_powers(
         self, state: State, covariance: FloatArray, gyro: FloatArray, accelerometer: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Residual power of every band, and ``tr(C J Z J')`` that the fit took from it, both sensors: (2, bands) each.
+        """Residual power of every band, and the part ``tr(C J Z J')`` of it that the fit took: (2, bands) each.
 
         Parameters
         ----------
@@ -139,49 +137,43 @@ class SegmentFactor:
         gyro, accelerometer : (bands, 10, 10) and (bands, m, m) ndarray
             Moments of the segment, not weighted.
         """
-        model = self.model
-        lift = np.eye(model.size)
+        L_g, L_a, J_g, J_a, slip = self._residuals(state)
         spread = covariance
-        if self._slip_rate_variance > 0.0:
-            _, state, gain, own = self._slipping(state)
-            lift = np.vstack([lift, -gain.T])
+        if slip is not None:
+            lift = np.vstack([np.eye(covariance.shape[0]), -slip.covariance @ slip.cross.T])
             spread = lift @ covariance @ lift.T
-            spread[-3:, -3:] += own
-        (L_g, L_a), (J_g, J_a) = model.matrices(state), model.jacobians(state)
-        if lift.shape[0] > model.size:
-            J_g = np.concatenate([J_g, _slip_jacobian(model, state)])
-        powers, spreads = [], []
+            spread[-3:, -3:] += slip.covariance
+            own = np.zeros((3, *J_g.shape[1:]))
+            own[:, :, 9] = slip.gain.T
+            J_g = np.concatenate([J_g, own])
+        powers, taken = [], []
         for L, J, C, Z in ((L_g, J_g, spread, gyro), (L_a, J_a, covariance, accelerometer)):
-            powers.append(np.einsum("ij,kjl,il->k", L, Z, L, optimize=True))
-            spreads.append(np.einsum("ab,aij,kjl,bil->k", C, J, Z, J, optimize=True))
-        return np.stack(powers), np.stack(spreads)
+            size, _, width = J.shape
+            powers.append(np.sum((L @ Z) * L, axis=(1, 2)))
+            turned = (C @ J.reshape(size, -1)).reshape(-1, width)
+            taken.append(np.sum((turned @ Z) * J.reshape(-1, width), axis=(1, 2)))
+        return np.stack(powers), np.stack(taken)
 
     def slip_rate_evidence(self, state: State) -> float:
         """``log det (I + variance H)`` of the slip rate that was eliminated."""
         if self._slip_rate_variance == 0.0:
             return 0.0
-        L_g, _ = self.model.matrices(state)
-        matrix = quadratic_forms(L_g, _slip_jacobian(self.model, state), self.moments.gyro)[2]
+        gain = self.model.sensor_matrices(state)[0]
+        matrix = gain.T @ gain * self.moments.gyro[9, 9]
         return float(np.linalg.slogdet(np.eye(3) + self._slip_rate_variance * matrix)[1])
 
-    def _slipping(self, state: State) -> tuple[Quadratic, State, FloatArray, FloatArray]:
-        """The cost at its best slip rate, the state with that rate in the gyroscope's bias, ``H_xs H_ss^-1`` (n, 3) and ``H_ss^-1``."""
-        moments, model = self.moments, self.model
-        precision = np.eye(3) / self._slip_rate_variance
-        L_g, _ = model.matrices(state)
-        # The rate enters the residual linearly: its best value follows from one solve.
-        _, gradient, matrix = quadratic_forms(L_g, _slip_jacobian(model, state), moments.gyro)
-        rate = -np.linalg.solve(matrix + precision, gradient)
-        state = {**state, "gyro_bias": model.value(state, "gyro_bias") + rate}
-        (L_g, L_a), (J_g, J_a) = model.matrices(state), model.jacobians(state)
-        J_g = np.concatenate([J_g, _slip_jacobian(model, state)])
-        c_g, g_g, H_g = quadratic_forms(L_g, J_g, moments.gyro)
-        c_a, g_a, H_a = quadratic_forms(L_a, J_a, moments.accelerometer)
-        n = model.size
-        own = np.linalg.inv(H_g[n:, n:] + precision)
-        gain = H_g[:n, n:] @ own
-        value = c_g + c_a + 0.5 * float(rate @ precision @ rate)
-        return Quadratic(value, g_g[:n] + g_a, H_g[:n, :n] - gain @ H_g[n:, :n] + H_a), state, gain, own
+    def _residuals(self, state: State) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, _Slip | None]:
+        """``L_g``, ``L_a`` and their derivatives, the gyroscope's at the best slip rate."""
+        (L_g, L_a), (J_g, J_a) = self.model.matrices(state), self.model.jacobians(state)
+        if self._slip_rate_variance == 0.0:
+            return L_g, L_a, J_g, J_a, None
+        # The rate adds to the bias: it enters the last column of L_g as M_g times the rate, and columns 3 to 5 hold -M_g.
+        Z, gain = self.moments.gyro, -L_g[:, 3:6]
+        own = np.linalg.inv(gain.T @ gain * Z[9, 9] + np.eye(3) / self._slip_rate_variance)
+        rate = -own @ (gain.T @ (L_g @ Z[:, 9]))
+        L_g[:, 9] += gain @ rate
+        J_g[:, :, 9] -= J_g[:, :, 3:6] @ rate
+        return L_g, L_a, J_g, J_a, _Slip(rate, gain, own, _cross(J_g, Z, gain))
 
     # ---- gtsam -----------------------------------------------------------------------------------------------
 
@@ -212,8 +204,15 @@ class SegmentFactor:
         return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(self.model.size + 1), list(self.keys), error)
 
 
-def _slip_jacobian(model: GraspModel, state: State) -> FloatArray:
-    """(3, 3, 10): derivative of L_g by a rate that adds to the gyroscope's bias."""
-    out = np.zeros((3, 3, GYRO_WIDTH))
-    out[:, :, 9] = model.sensor_matrices(state)[0].T
-    return out
+@dataclass(frozen=True)
+class _Slip:
+    """The best slip rate (3,), ``M_g``, the rate's conditional covariance, and the curvature (n, 3) that it shares with the unknowns."""
+
+    rate: FloatArray
+    gain: FloatArray
+    covariance: FloatArray
+    cross: FloatArray
+
+
+def _cross(J_g: FloatArray, Z: FloatArray, gain: FloatArray) -> FloatArray:
+    return np.asarray((J_g @ Z[:, 9]) @ gain)

@@ -31,7 +31,7 @@ from factorgrasp.problems.grasp_system import (
 )
 from factorgrasp.problems.grasp_track import GraspTrack
 from factorgrasp.problems.grasp_windows import Moments, compress
-from factorgrasp.typing import FloatArray, IntArray, State
+from factorgrasp.typing import BoolArray, FloatArray, IntArray, State
 from factorgrasp.uncertainty import Covariance
 from factorgrasp.variables import Variable, retract, slices
 
@@ -146,7 +146,9 @@ class GraspSegments:
         return {variable.name: out[variable.name] for variable in self.variables}
 
     def linearize(self, state: State) -> LeastSquares:
-        """Rows of every segment's factor (see :meth:`Quadratic.rows`), of the walk and of the priors."""
+        """Rows of every segment's factor (see :meth:`Quadratic.rows`), of the walk and of the priors; summed when the grasp is static."""
+        if self.static:
+            return self.problem.linearize(state)
         if self._pattern is None:
             self._pattern = self._make_pattern()
         system = self._pattern
@@ -155,10 +157,9 @@ class GraspSegments:
         blocks = {v.name: A[:, :, self.model.columns[v.name]].reshape(-1, v.size) for v in self._shared}
         for k, names in enumerate(self._names):
             for name, part in zip(names, (slice(0, 3), slice(3, 6)), strict=True):
-                blocks[name] = A[:, :, part].reshape(-1, 3) if self.static else A[k, :, part].ravel()
+                blocks[name] = A[k, :, part].ravel()
         system.set_term("moments", blocks, b.ravel())
-        if not self.static:
-            self._fill_walk(system, state)
+        self._fill_walk(system, state)
         first = self.local(state, 0)
         for variable in self.model.variables:
             name = f"prior of {variable.name}"
@@ -180,7 +181,14 @@ class GraspSegments:
         return self._refine_wandering(state)
 
     def escape(self, state: State) -> State | None:
-        """A start in the basin of a better rotation, judged for the mean grasp; None when there is none."""
+        """A start in the basin of a better rotation, judged for the mean grasp; None when there is none.
+
+        A problem that was posed afresh stays in the basin that was found before.
+        """
+        if self.static:
+            return self.problem.escape(state)
+        if self._start is not None:
+            return None
         shared = {variable.name: state[variable.name] for variable in self._shared}
         rotation = lie.project_to_so3(np.mean([state[names[0]] for names in self._names], axis=0))
         translation = np.mean([state[names[1]] for names in self._names], axis=0)
@@ -193,9 +201,9 @@ class GraspSegments:
         Rows take the absolute value of a segment's curvature H. Where that differs from H, this is what makes the sandwich come out as
         ``H^-1 M H^-1`` all the same.
         """
-        rows, information, meat = self._information(state)
         if self.static:
-            meat = self.problem.score_covariance(state)
+            return self.problem.score_covariance(state)
+        rows, information, meat = self._information(state)
         gain = rows @ np.linalg.inv(information)
         return np.asarray(gain @ meat @ gain.T)
 
@@ -214,11 +222,11 @@ class GraspSegments:
 
     def view(self, estimate: Estimate) -> GraspTrack:
         """The grasp over time, with the whole time offset."""
+        if self.static:
+            return GraspTrack.from_pose(self.problem.view(estimate), float(self.t.mean()))
         shift = float(estimate.values["time_offset"][0]) if "time_offset" in estimate.values else 0.0
-        nodes = self._names[:1] if self.static else self._names
-        times = np.array([self.t.mean()]) if self.static else self.t
         return GraspTrack.from_estimate(
-            estimate, times, nodes, self.problem.time_offset + shift, self._numbers
+            estimate, self.t, self._names, self.problem.time_offset + shift, self._numbers
         )
 
     # ---- as a gtsam graph ------------------------------------------------------------------------------------
@@ -260,8 +268,9 @@ class GraspSegments:
     def increments(self, start: State | None = None) -> Iterator[tuple[list[Any], Any, dict[int, float]]]:
         """The graph segment by segment, for a smoother: ``(factors, new values, stamps)``.
 
-        Factors are :class:`SegmentFactor` (a Hessian factor to be made at the smoother's values) and gtsam factors. Values of a new segment are
-        a function of the smoother's present values: the grasp of the segment before. Stamps (s, robot clock) renew those of the shared unknowns.
+        Factors are :class:`SegmentFactor` (a Hessian factor to be made at the smoother's values) and gtsam factors. Values of a new
+        segment are a function of the smoother's present ones: the grasp of the segment before. Stamps (s, robot clock) renew those of the
+        shared unknowns.
 
         Parameters
         ----------
@@ -367,10 +376,8 @@ class GraspSegments:
             local = self.local(state, k)
             out -= factor.quadratic(local).value + 0.5 * factor.slip_rate_evidence(local)
         system = self.linearize(state)
-        residuals = system.residuals(np.zeros(system.size))
-        tied = np.ones(residuals.size, dtype=bool)
-        tied[system.jacobian.slices["moments"]] = False
-        out -= 0.5 * float(residuals[tied] @ residuals[tied])
+        residuals = system.residuals(np.zeros(system.size))[_tying_rows(system)]
+        out -= 0.5 * float(residuals @ residuals)
         if not self.static:
             steps = np.log(np.diff(self.t)).sum()
             out -= 3.0 * (
@@ -401,16 +408,16 @@ class GraspSegments:
         count, rows = len(self.factors), self.model.size + 1
         names = tuple(variable.name for variable in self.variables)
         pattern = {}
+        for k, (rotation, translation) in enumerate(self._names):
+            own = np.zeros((count * rows, 3), dtype=bool)
+            own[k * rows : (k + 1) * rows] = True
+            pattern[rotation] = pattern[translation] = own
         walks = []
-        if not self.static:
-            for k, (rotation, translation) in enumerate(self._names):
-                own = np.zeros((count * rows, 3), dtype=bool)
-                own[k * rows : (k + 1) * rows] = True
-                pattern[rotation] = pattern[translation] = own
+        if count > 1:
             walks = [
                 self._walk_term("rotation walk", 0, self.rotation_walk_sd, "rad"),
                 self._walk_term("translation walk", 1, self.translation_walk_sd, "m"),
-            ] * (count > 1)
+            ]
         terms = [Term("moments", count * rows, names, group=rows, pattern=pattern), *walks]
         for variable in self.model.variables:
             values = self._precision[self.model.columns[variable.name]]
@@ -470,9 +477,7 @@ class GraspSegments:
         system = self.linearize(state)
         matrix, _ = system.whitened()
         rows = (matrix.T @ matrix).toarray()
-        tied = matrix.copy()
-        own = system.jacobian.slices["moments"]
-        tied.data[matrix.indptr[own.start] : matrix.indptr[own.stop]] = 0.0
+        tied = matrix[_tying_rows(system)]
         information = (tied.T @ tied).toarray()
         meat = information.copy()
         for k, columns in enumerate(self._columns()):
@@ -563,9 +568,12 @@ class GraspSegments:
         trusted = powers[0] <= LARGEST_DISAGREEMENT * np.einsum("bkii->k", moments.gyro[:, :, 0:3, 0:3])
         if not base.settings.adapt_noise:
             return BandVariances(declared.gyro, declared.accelerometer, trusted)
-        free = np.maximum(3.0 * dof - spreads * np.stack(current.weights), 0.25 * 3.0 * dof)
+        taken = np.minimum(spreads * np.stack(current.weights) / (3.0 * dof), 0.75)
         prior = np.stack([declared.gyro, declared.accelerometer])
-        gyro, accelerometer = (powers + PRIOR_DOF * prior) / (free + PRIOR_DOF)
+        found = (powers + PRIOR_DOF * prior) / (3.0 * dof * (1.0 - taken) + PRIOR_DOF)
+        # Where a free grasp takes most of what a band holds, more power frees more of it: without damping the weights swing to and fro.
+        present = np.stack([current.gyro, current.accelerometer])
+        gyro, accelerometer = present * (found / present) ** (1.0 - 0.5 * taken)
         return BandVariances(gyro, accelerometer, trusted)
 
     def _window_norms(self, state: State, variances: BandVariances) -> FloatArray:
@@ -644,6 +652,15 @@ def _cut_moments(problem: GraspPose, label: IntArray) -> Moments:
     return compress(
         problem._grid.windowing, windows.gyro, windows.accelerometer, label, problem._weights.windows
     )
+
+
+def _tying_rows(system: LeastSquares) -> BoolArray:
+    """Rows of the walk and the priors."""
+    out = np.ones(system.jacobian.height, dtype=bool)
+    for name in ("moments", "gyroscope", "accelerometer"):
+        if name in system.terms:
+            out[system.jacobian.slices[name]] = False
+    return out
 
 
 def _insert_from(source: Any, key: int, name: int, target: Any) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 from factorgrasp import lie
 from factorgrasp.estimate import Estimate, TermSummary
 from factorgrasp.observability import Observability
+from factorgrasp.problems.grasp_estimate import GraspPoseEstimate
 from factorgrasp.status import Status
 from factorgrasp.typing import FloatArray, JsonDict
 
@@ -71,6 +72,19 @@ class GraspTrack:
             covariance=covariance,
             time_offset=time_offset,
             nodes=tuple(nodes),
+        )
+
+    @classmethod
+    def from_pose(cls, pose: GraspPoseEstimate, t: float) -> GraspTrack:
+        """The answer to the unsegmented problem as a track of one node."""
+        return cls(
+            estimate=pose.estimate,
+            t=np.array([t]),
+            rotation=pose.rotation[None],
+            translation=pose.translation[None],
+            covariance=pose.covariance[None],
+            time_offset=pose.time_offset,
+            nodes=(("rotation", "translation"),),
         )
 
     @property

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from factorgrasp.recordings import PoseStream
+from factorgrasp.problems.grasp_model_check import ModelCheck
 from factorgrasp.typing import FloatArray
 
 # Rates whose second principal axis carries less than this part of the power turn about one axis only.
@@ -38,8 +38,16 @@ def direction(variable: str, vector: FloatArray, rate_moment: FloatArray) -> str
     return words
 
 
-def advice(rate_moment: FloatArray, robot: object) -> str:
-    """What would inform the missing directions."""
+def advice(rate_moment: FloatArray, check: ModelCheck | None) -> str:
+    """What would inform the missing directions.
+
+    Parameters
+    ----------
+    rate_moment : (3, 3) ndarray
+        Mean of ``w_r w_r'``, (rad/s)^2.
+    check : ModelCheck or None
+        Outcome of the model check, where it ran.
+    """
     _, second = rotation_axis(rate_moment)
     speed = float(np.sqrt(max(np.trace(rate_moment), 0.0)))
     if speed < 0.05:
@@ -52,13 +60,22 @@ def advice(rate_moment: FloatArray, robot: object) -> str:
             "The end-effector rotates about one axis only, and a lever arm along that axis moves nothing. "
             "Add rotation about a second axis (a conical motion, or two rotations one after the other)."
         )
-    words = (
+    if check is not None and check.phantom > 0.0:
+        return (
+            f"The robot's stream agrees with the hand only up to {check.confirmed:.1f} Hz; above that it shows motion which "
+            "the hand does not make, as poses do that were interpolated from few samples or have jittered stamps. "
+            f"Its accelerations may then move the lever arm by {1e3 * check.phantom:.0f} mm. Record the robot side faster, "
+            "with its own time stamps."
+        )
+    if check is not None and check.band_spread > 0.0:
+        return (
+            f"Frequency bands disagree about the lever arm by {1e3 * check.band_spread:.1f} mm: the accelerations of the two "
+            "sides are not those of one rigid body. Check the mounting, the robot's noise in [noise], and the sensor's range."
+        )
+    return (
         f"The rotation ({np.degrees(speed):.2g} deg/s rms) is too weak or too slow for the noise in the acceleration: "
         "rotate faster or longer, about changing axes."
     )
-    if isinstance(robot, PoseStream) and robot.rate < 200.0:
-        words += " Poses sampled or interpolated from few samples a second carry no acceleration: record the robot side faster."
-    return words
 
 
 def unrelated(correlation: float, rate_moment: FloatArray) -> str:
@@ -70,4 +87,16 @@ def unrelated(correlation: float, rate_moment: FloatArray) -> str:
         f"Robot and hand do not turn together (correlation of their angular rates {correlation:.2f} at the "
         "best offset): the recordings may not belong to the same motion, the clocks may differ by more than "
         "max_time_offset, or the quaternions may be in another order or direction than w, x, y, z body-to-world."
+    )
+
+
+def contradiction(accelerometer_bias: FloatArray, sd: float) -> str:
+    """What it may mean that only an impossible accelerometer bias reconciles the two sides; empty when it is plausible."""
+    size = float(np.linalg.norm(accelerometer_bias))
+    if size < 6.0 * sd or size < 2.0:
+        return ""
+    return (
+        f"The specific forces of the two sides differ by {size:.1f} m/s^2 that no sensor bias explains: check the sign and "
+        "frame of gravity, that the quaternions are w, x, y, z body-to-world, and that the accelerometer reads m/s^2 with "
+        "gravity in it."
     )

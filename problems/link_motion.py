@@ -108,6 +108,39 @@ class LinkKinematics(NamedTuple):
 
 
 @dataclass(frozen=True)
+class BodyTree:
+    """What of an articulated body does not move: links, joints and how they hang together.
+
+    Attributes
+    ----------
+    links, joints : tuple of str
+    spatial_inertia : ndarray
+        (L, 6, 6) about the links' origins.
+    mass : ndarray
+        (L,) kg.
+    parents, children : ndarray
+        (J,) links of every joint.
+    dofs : tuple of tuple of str
+        By joint; empty where the axes are unknown.
+    subspaces : tuple of ndarray or None
+        (6, n_j) by joint where it does not change over time, else None.
+    root : int
+    fixed_base : bool
+    """
+
+    links: tuple[str, ...]
+    joints: tuple[str, ...]
+    spatial_inertia: FloatArray
+    mass: FloatArray
+    parents: IntArray
+    children: IntArray
+    dofs: tuple[tuple[str, ...], ...]
+    subspaces: tuple[FloatArray | None, ...]
+    root: int
+    fixed_base: bool
+
+
+@dataclass(frozen=True)
 class LinkMotion:
     """Motion of the links of one articulated body over n frames, in world axes.
 
@@ -242,6 +275,16 @@ class LinkMotion:
         parts = {name: getattr(self, name)[index] for name in names}
         qdd = None if self.joint_acceleration is None else self.joint_acceleration[index]
         return replace(self, joints=joints, joint_acceleration=qdd, **parts)
+
+    @property
+    def tree(self) -> BodyTree:
+        """What of the body does not move."""
+        return BodyTree(
+            self.links, tuple(joint.name for joint in self.joints), self.spatial_inertia, self.mass, self.parents, self.children,
+            tuple(joint.dofs for joint in self.joints),
+            tuple(None if joint.subspace is None or joint.subspace.ndim == 3 else joint.subspace for joint in self.joints),
+            self.root, self.base == "fixed",
+        )  # fmt: skip
 
     # ---- body-frame quantities --------------------------------------------------------------------------------
 

@@ -12,8 +12,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from factorgrasp.errors import InputError
-from factorgrasp.problems.link_motion import GRAVITY, LinkJoint, LinkKinematics, LinkMotion
-from factorgrasp.problems.link_motion_spatial import cross_motion, motion_transform, rotate, rotate_back, skew
+from factorgrasp.problems.link_motion import GRAVITY, BodyTree, LinkJoint, LinkKinematics, LinkMotion
+from factorgrasp.problems.link_motion_spatial import (
+    cross_motion,
+    motion_transform,
+    rotate,
+    rotate_back,
+    skew,
+    spatial_inertia,
+)
 from factorgrasp.typing import FloatArray, IntArray
 
 FEW_FRAMES = 4
@@ -101,6 +108,14 @@ class PinocchioTree:
     def children(self) -> IntArray:
         """(J,) link below every joint."""
         return np.array([c.child for c in self._chains], dtype=np.intp)
+
+    @property
+    def tree(self) -> BodyTree:
+        """What of the body does not move."""
+        return BodyTree(
+            self.links, self.joint_names, spatial_inertia(self.mass, self.com, self.inertia), self.mass, self.parents, self.children,
+            self._dofs, tuple(self._fixed_subspaces), 0, not self.floating,
+        )  # fmt: skip
 
     def motion(self, t: ArrayLike, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike) -> LinkMotion:
         """Link motion of n frames.

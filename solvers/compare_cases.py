@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,11 +19,12 @@ from factorgrasp.errors import NotSolvedError
 from factorgrasp.estimate import Certificate
 from factorgrasp.least_squares import LeastSquares, QuadraticProgram
 from factorgrasp.problem import NonlinearProblem
-from factorgrasp.solvers.base import NonlinearSolution, Solution, Solver, SolverOptions
+from factorgrasp.solvers.base import Solution, Solver, SolverOptions
 from factorgrasp.solvers.certificate import OptimalityCheck, certify, check_least_squares
 from factorgrasp.solvers.factor import active_set, posterior_factor
 from factorgrasp.solvers.gauss_newton import GaussNewton
 from factorgrasp.solvers.measure import Solve, Timing, measure
+from factorgrasp.solvers.native import native_descent
 from factorgrasp.solvers.outer_loop import LoopOptions, LoopResult, solve_linear, solve_nonlinear
 from factorgrasp.solvers.qp import QpSession
 from factorgrasp.solvers.registry import get_solver
@@ -219,7 +219,7 @@ class NonlinearCase(Case):
         def fresh() -> Solve:
             solver = get_solver(name, options)
             loop = LoopOptions()
-            descend = _native(solver) or GaussNewton(solver, loop)
+            descend = native_descent(solver) or GaussNewton(solver, loop)
 
             def run(start: Solution | None) -> Solution:
                 began = time.perf_counter()
@@ -274,46 +274,6 @@ def _timed(solver: Solver, problem: LeastSquares, start: Solution | None) -> Sol
     found = solver.solve(warm_start=start)
     elapsed = time.perf_counter() - began
     return replace(found, setup_time=max(elapsed - found.solve_time, 0.0))
-
-
-def _native(solver: Solver) -> Callable[[NonlinearProblem, State], LoopResult] | None:
-    """A solver that takes nonlinear problems whole, as a descent of the outer loop."""
-    whole: Callable[[NonlinearProblem, State], NonlinearSolution] | None = getattr(
-        solver, "solve_problem", None
-    )
-    if whole is None or not solver.capabilities.nonlinear:
-        return None
-
-    def descend(problem: NonlinearProblem, state: State) -> LoopResult:
-        found = whole(problem, state)
-        system = problem.linearize(found.state)
-        weights = system.robust_weights(system.residuals(np.zeros(system.size)))
-        solution = Solution(
-            np.zeros(system.size), found.status, y=_multipliers(system, weights), message=found.message
-        )
-        return LoopResult(
-            problem,
-            found.state,
-            system,
-            solution,
-            weights,
-            found.status,
-            found.message,
-            iterations=found.iterations,
-            setup_time=found.setup_time,
-            solve_time=found.solve_time,
-        )
-
-    return descend
-
-
-def _multipliers(system: LeastSquares, weights: FloatArray | None) -> FloatArray:
-    """Multipliers of the equalities at the point of linearisation, from stationarity: gtsam reports none."""
-    if not system.equalities.height:
-        return np.empty(0)
-    matrix, rhs = system.whitened(weights)
-    dense = system.equalities.matrix.toarray()
-    return np.asarray(np.linalg.lstsq(dense.T, matrix.T @ rhs, rcond=None)[0])
 
 
 def _at(result: LoopResult) -> LeastSquares:

@@ -53,11 +53,11 @@ SOLVERS.update({name: "factorgrasp.solvers.qp:solver_class" for name in QPSOLVER
 
 QP_PREFERENCE: tuple[str, ...] = (
     "piqp",
-    "proxqp",
     "clarabel",
-    "quadprog",
     "daqp",
     "highs",
+    "proxqp",
+    "quadprog",
     "cvxopt",
     "qpalm",
     "osqp",

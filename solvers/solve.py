@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from typing import Any
-
-import numpy as np
 
 from factorgrasp.errors import InputError, SolverError
 from factorgrasp.least_squares import LeastSquares
 from factorgrasp.problem import LinearProblem, NonlinearProblem
 from factorgrasp.provenance import problem_hash
-from factorgrasp.solvers.base import NonlinearSolution, Solution, Solver, SolverOptions
+from factorgrasp.solvers.base import Solver, SolverOptions
 from factorgrasp.solvers.gauss_newton import GaussNewton
 from factorgrasp.solvers.make_estimate import make_estimate
+from factorgrasp.solvers.native import native_descent
 from factorgrasp.solvers.outer_loop import LoopOptions, LoopResult, solve_linear, solve_nonlinear
 from factorgrasp.solvers.registry import QP_PREFERENCE, get_solver, solver_class
 from factorgrasp.typing import State
@@ -123,23 +121,5 @@ def _nonlinear(
     system = problem.linearize(start)
     asked = problem_hash(problem.kind, system, start)
     chosen = _choose(solver, options, system)
-    descend: Callable[[Any, State], LoopResult] = GaussNewton(chosen, loop)
-    native = getattr(chosen, "solve_problem", None)
-    if chosen.capabilities.nonlinear and native is not None:
-        descend = _native(native)
+    descend = native_descent(chosen) or GaussNewton(chosen, loop)
     return solve_nonlinear(problem, descend, start, loop), chosen, asked
-
-
-def _native(solve_problem: Callable[[Any, State], NonlinearSolution]) -> Callable[[Any, State], LoopResult]:
-    def descend(problem: NonlinearProblem, state: State) -> LoopResult:
-        found = solve_problem(problem, state)
-        system = problem.linearize(found.state)
-        zero = np.zeros(system.size)
-        weights = system.robust_weights(system.residuals(zero))
-        solution = Solution(zero, found.status, message=found.message)
-        return LoopResult(
-            problem, found.state, system, solution, weights, found.status, found.message,
-            iterations=found.iterations, setup_time=found.setup_time, solve_time=found.solve_time,
-        )  # fmt: skip
-
-    return descend

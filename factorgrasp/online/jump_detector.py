@@ -1,19 +1,18 @@
-"""Has the grasp changed? Log Bayes factors of a jump in (R, r) at several times back and of several sizes (mathematics 2.3).
+"""Has the grasp changed? Log Bayes factors of a change in (R, r) at several times back and of several sizes (mathematics 2.3).
 
 Second moments of short segments (0.1 s apart) say what the newest seconds ask for; snapshots of the running estimate say what was known before each of
-them. With ``g, H`` the gradient and Gauss-Newton matrix of the segments since a start, ``P`` the covariance of the snapshot taken at that start and ``u = g + H mu`` the
-gradient at its mean, a jump ``d ~ N(0, D)`` of the grasp has evidence through
+them. With ``g, H`` the gradient and Gauss-Newton matrix of the segments since a start, ``P`` the covariance of the snapshot taken at that start and
+``u = g + H mu`` the gradient at its mean, a jump ``d ~ N(0, D)`` of the grasp shows through
 
     W = E' (I + H P)^-1 H E,   q = -E' (I + H P)^-1 u       (E picks rotation and translation)
     log p(segments | jump) / p(segments | none) = 1/2 q' (D^-1 + W)^-1 q - 1/2 log det(I + D W)     for known noise
 
-so the uncertainty of the estimate before and of the biases, which the jump leaves alone, is accounted for. The noise level is not taken as
+so the uncertainty of the estimate before and of the biases, which a jump leaves alone, is accounted for. The noise level is not taken as
 known: the residual power of the very segments under test decides, through the Student factor of an unknown common variance.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,10 +21,10 @@ from factorgrasp.online.row_history import RowHistory
 from factorgrasp.typing import FloatArray
 
 GRASP = 6
-# Segments back at which a jump may have begun.
+# Segments back at which a change may have begun.
 STARTS = (1, 2, 3, 4, 6, 8, 11, 15, 20, 27, 36, 50)
-# Sizes of a jump, as multiples of 10 deg and 70 mm.
-SCALES = (3.0, 1.0, 0.3, 0.1, 0.03)
+# Sizes of a change, as multiples of 10 deg and 70 mm.
+_SCALES = np.array([3.0, 1.0, 0.3, 0.1, 0.03])
 _UNIT = np.repeat([np.deg2rad(10.0), 0.07], 3)
 # The level of the noise is known beforehand as if from this many residuals.
 _PRIOR_RESIDUALS = 60.0
@@ -63,56 +62,134 @@ class JumpDetector:
     def __init__(self, size: int) -> None:
         self.size = size
         self._segments = RowHistory(STARTS[-1] + 1, 2 + size + size**2)
-        self._snapshots = RowHistory(STARTS[-1] + 1, size + size**2)
+        self._snapshots = RowHistory(STARTS[-1] + 2, size + size**2)
 
     def add_segment(self, time: float, cost: float, gradient: FloatArray, information: FloatArray, residuals: float) -> None:
         """Cost, gradient (n,), Gauss-Newton matrix (n, n) at the reference state of a segment that ends at `time`, and its number of residuals."""
         row = np.concatenate([[cost, residuals], gradient, information.ravel()])
-        self._segments.append(np.array([time]), row[None], self._segments.run == 0)
+        self._segments.append(np.array([time]), row[None], False)
 
     def add_snapshot(self, time: float, mean: FloatArray, covariance: FloatArray) -> None:
         """Estimate relative to the reference state (n,) and its covariance (n, n) from data up to `time`."""
-        self._snapshots.append(np.array([time]), np.concatenate([mean, covariance.ravel()])[None], self._snapshots.run == 0)
+        self._snapshots.append(np.array([time]), np.concatenate([mean, covariance.ravel()])[None], False)
 
-    def test(self) -> list[Jump]:
-        """The best jump for every start that has a snapshot, newest start first."""
-        n = self.size
-        # The newest snapshot was taken after the newest segment; one `k` segments back is the (k + 1)-th newest.
-        known = min(self._segments.kept, self._snapshots.kept - 1)
-        starts = [k for k in STARTS if k <= known]
+    def forget_segments(self) -> None:
+        """Before the segments are given again for another reference state or other weights."""
+        self._segments.run = 0
+
+    def forget(self) -> None:
+        """Before another grasp."""
+        self._segments.run = self._snapshots.run = 0
+
+    def move(self, shift: FloatArray) -> None:
+        """The reference state moved by a tangent step (n,)."""
+        self._snapshots.last(self._snapshots.kept)[:, : self.size] -= shift
+
+    def widened(self, where: FloatArray, size: int, variances: FloatArray) -> JumpDetector:
+        """A detector for a model of `size` unknowns, in which those of this one stand at `where` and the new ones have prior `variances` (size,)."""
+        out = JumpDetector(size)
+        n, count = self.size, self._snapshots.kept
+        for time, row in zip(self._snapshots.last_times(count), self._snapshots.last(count), strict=True):
+            mean, covariance = np.zeros(size), np.diag(variances)
+            mean[where] = row[:n]
+            covariance[np.ix_(where, where)] = row[n:].reshape(n, n)
+            out.add_snapshot(float(time), mean, covariance)
+        return out
+
+    @property
+    def starts(self) -> list[int]:
+        """Starts (segments back) for which there is a snapshot."""
+        # The newest snapshot was taken after the segment before the newest; one `k` segments back is the k-th newest.
+        known = min(self._segments.kept, self._snapshots.kept)
+        return [k for k in STARTS if k <= known]
+
+    def snapshot(self, segments: int) -> tuple[float, FloatArray, FloatArray]:
+        """Time, mean (n,) and covariance (n, n) of the estimate before the newest `segments`."""
+        row = self._snapshots.last(segments)[0]
+        return float(self._snapshots.last_times(segments)[0]), row[: self.size], row[self.size :].reshape(self.size, self.size)
+
+    def jumps(self) -> list[Jump]:
+        """The best jump for every start, newest start first."""
+        starts, n = self.starts, self.size
         if not starts:
             return []
         rows = self._segments.last(starts[-1])[::-1]
         sums = np.cumsum(np.add.reduceat(rows, [0, *starts[:-1]], axis=0), axis=0)
-        snapshots = self._snapshots.last(starts[-1] + 1)[::-1][starts]
-        mean, P = snapshots[:, :n], snapshots[:, n:].reshape(-1, n, n)
         cost, count, g, H = sums[:, 0], sums[:, 1], sums[:, 2 : 2 + n], sums[:, 2 + n :].reshape(-1, n, n)
-        Hm = np.matmul(H, mean[:, :, None])[:, :, 0]
-        u = g + Hm
-        B = np.matmul(H, P)
-        B[:, np.arange(n), np.arange(n)] += 1.0
-        solved = np.linalg.solve(B, np.concatenate([u[:, :, None], H[:, :, :GRASP]], axis=2))
-        explained = np.einsum("si,sij,sj->s", u, P, solved[:, :, 0])
-        rss = 2.0 * cost + np.sum((2.0 * g + Hm) * mean, axis=1) - explained
-        q, W = -solved[:, :GRASP, 0], solved[:, :GRASP, 1:]
-        values, vectors = np.linalg.eigh(_UNIT[:, None] * (0.5 * (W + W.transpose(0, 2, 1))) * _UNIT)
-        values = np.maximum(values, 0.0)
-        y = np.matmul((_UNIT * q)[:, None, :], vectors)[:, 0, :]
-        square = np.square(SCALES)[:, None, None]
-        gain = square / (1.0 + square * values)  # (scales, starts, 6)
-        drop = np.sum(gain * y**2, axis=2)
-        occam = 0.5 * np.sum(np.log1p(square * values), axis=2)
-        level = _PRIOR_RESIDUALS + count
-        before = _PRIOR_RESIDUALS + np.maximum(rss, 0.0)
-        after = np.maximum(before - drop, 1e-3 * before)
-        factor = 0.5 * level * np.log(before / after) - occam
-        best = np.argmax(factor, axis=0)
-        out = []
-        for s, k in enumerate(starts):
-            shrink = gain[best[s], s]
-            basis = _UNIT[:, None] * vectors[s]
-            noise = max(1.0, float(after[best[s], s] / level[s]))
-            out.append(
-                Jump(k, float(factor[best[s], s]), basis @ (shrink * y[s]), noise * (basis * shrink) @ basis.T)
+        snapshots = self._snapshots.last(starts[-1])[::-1][np.array(starts) - 1]
+        mean, P = snapshots[:, :n], snapshots[:, n:].reshape(-1, n, n)
+        cross, own = H[:, :, :GRASP], H[:, :GRASP, :GRASP]
+        return _explain(starts, cost, count, mean, P, g, H, g[:, :GRASP], cross, own)
+
+    def ramps(self) -> list[Jump]:
+        """The best steady drift since every start; `step` is how far it has come."""
+        starts, n = self.starts, self.size
+        if not starts:
+            return []
+        rows = self._segments.last(starts[-1])[::-1]
+        cost, count, g, H = rows[:, 0], rows[:, 1], rows[:, 2 : 2 + n], rows[:, 2 + n :].reshape(-1, n, n)
+        parts: list[list[FloatArray]] = []
+        for k in starts:
+            u = 1.0 - (np.arange(k) + 0.5) / k
+            H_k = H[:k]
+            parts.append(
+                [
+                    cost[:k].sum(),
+                    count[:k].sum(),
+                    g[:k].sum(axis=0),
+                    H_k.sum(axis=0),
+                    u @ g[:k, :GRASP],
+                    np.tensordot(u, H_k[:, :, :GRASP], 1),
+                    np.tensordot(u**2, H_k[:, :GRASP, :GRASP], 1),
+                ]
             )
-        return out
+        c, m, g_s, H_s, g_d, cross, own = (np.array(part) for part in zip(*parts, strict=True))
+        snapshots = self._snapshots.last(starts[-1])[::-1][np.array(starts) - 1]
+        mean, P = snapshots[:, :n], snapshots[:, n:].reshape(-1, n, n)
+        return _explain(starts, c, m, mean, P, g_s, H_s, g_d, cross, own)
+
+
+def _explain(
+    starts: list[int],
+    cost: FloatArray,
+    count: FloatArray,
+    mean: FloatArray,
+    P: FloatArray,
+    g: FloatArray,
+    H: FloatArray,
+    g_d: FloatArray,
+    cross: FloatArray,
+    own: FloatArray,
+) -> list[Jump]:
+    """Evidence for a change d that enters with gradient `g_d` (S, 6), information `own` (S, 6, 6) and `cross` (S, n, 6) to all unknowns."""
+    n = g.shape[1]
+    Hm = np.matmul(H, mean[:, :, None])[:, :, 0]
+    u = g + Hm
+    B = np.matmul(H, P)
+    B[:, np.arange(n), np.arange(n)] += 1.0
+    # (P^-1 + H)^-1 = P (I + H P)^-1
+    solved = np.matmul(P, np.linalg.solve(B, np.concatenate([u[:, :, None], cross], axis=2)))
+    rss = 2.0 * cost + np.sum((2.0 * g + Hm) * mean, axis=1) - np.sum(u * solved[:, :, 0], axis=1)
+    turned = cross.transpose(0, 2, 1)
+    pulled = np.matmul(turned, np.stack([mean, solved[:, :, 0]], axis=2))
+    q = -(g_d + pulled[:, :, 0] - pulled[:, :, 1])
+    W = own - np.matmul(turned, solved[:, :, 1:])
+    values, vectors = np.linalg.eigh(_UNIT[:, None] * (0.5 * (W + W.transpose(0, 2, 1))) * _UNIT)
+    values = np.maximum(values, 0.0)
+    y = np.matmul((_UNIT * q)[:, None, :], vectors)[:, 0, :]
+    square = (_SCALES**2)[:, None, None]
+    gain = square / (1.0 + square * values)
+    drop = np.sum(gain * y**2, axis=2)
+    occam = 0.5 * np.sum(np.log1p(square * values), axis=2)
+    level = _PRIOR_RESIDUALS + count
+    before = _PRIOR_RESIDUALS + np.maximum(rss, 0.0)
+    after = np.maximum(before - drop, 1e-3 * before)
+    factor = 0.5 * level * np.log(before / after) - occam
+    best = np.argmax(factor, axis=0)
+    out = []
+    for s, k in enumerate(starts):
+        shrink = gain[best[s], s]
+        axes = _UNIT[:, None] * vectors[s]
+        noise = max(1.0, float(after[best[s], s] / level[s]))
+        out.append(Jump(k, float(factor[best[s], s]), axes @ (shrink * y[s]), noise * (axes * shrink) @ axes.T))
+    return out

@@ -11,7 +11,6 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from factorgrasp.online.coupled_rows import ACCELEROMETER, GYRO, shift_hand
 from factorgrasp.problems.grasp_model import GYRO_WIDTH
-from factorgrasp.problems.grasp_noise import BandVariances, NoiseMoments
 from factorgrasp.problems.grasp_windows import Moments, Windowing
 from factorgrasp.typing import FloatArray
 
@@ -52,6 +51,8 @@ class WindowBank:
         K, m = self.windowing.bins, self.width
         self._exponent = 0.0
         self._windows = 0
+        self.count = 0.0
+        """Half-overlapping windows taken, not faded."""
         self._stretch = max(2, round(2.0 / self.share))
         shape = (_MOST_STRETCHES, 2 if self._weighted else 1)
         self._gyro = np.zeros((*shape, K, GYRO_WIDTH, GYRO_WIDTH))
@@ -61,6 +62,11 @@ class WindowBank:
         self._total_gyro = np.zeros((shape[1], K, GYRO_WIDTH, GYRO_WIDTH))
         self._total_accelerometer = np.zeros((shape[1], K, m, m))
         self._total_weight = np.zeros(shape[1])
+
+    @property
+    def squares(self) -> bool:
+        """Whether windows have weights other than one, so that squared ones are kept too."""
+        return self._weighted
 
     @property
     def weight(self) -> float:
@@ -91,6 +97,7 @@ class WindowBank:
 
     def _add(self, c: FloatArray, trust: FloatArray | None) -> None:
         n = c.shape[0]
+        self.count += self.share * n
         gyro, accelerometer = c[..., GYRO], c[..., ACCELEROMETER]
         factors = [np.full(n, self.share)]
         if self._weighted:
@@ -168,12 +175,6 @@ class WindowBank:
             gyro_squared=scale**2 * self._gyro[:count, 1] if self._weighted else None,
             accelerometer_squared=scale**2 * self._accelerometer[:count, 1] if self._weighted else None,
         )
-
-
-def expected_sums(noise: NoiseMoments, variances: BandVariances, dof: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Expected noise (10, 10) and (m, m) in the weighted sums of one half-overlapping window."""
-    w_g, w_a = variances.weights
-    return np.tensordot(w_g * dof, noise.gyro, 1), np.tensordot(w_a * dof, noise.accelerometer, 1)
 
 
 def _gram(z: FloatArray, weights: FloatArray) -> FloatArray:

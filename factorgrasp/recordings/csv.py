@@ -15,9 +15,7 @@ Without a unit in the header values are SI: s, m, rad/s, m/s^2, rad. With one (`
 
 from __future__ import annotations
 
-import os
 import re
-import tempfile
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -25,6 +23,7 @@ from typing import TypeAlias, TypeVar
 
 import numpy as np
 
+from factorgrasp.atomic import write_text
 from factorgrasp.errors import InputError
 from factorgrasp.recordings._validate import QUATERNION_NORM_TOLERANCE
 from factorgrasp.recordings.streams import ImuStream, JointStream, MotionStream, PoseStream
@@ -226,17 +225,4 @@ def write_csv(path: PathLike, stream: Stream) -> None:
     content = "\n".join([header, *(",".join(map(repr, row)) for row in rows), ""])
     if not file.parent.is_dir():
         raise InputError(str(file), "a path in an existing folder", f"no folder {file.parent}")
-    handle, temporary = tempfile.mkstemp(dir=file.parent, prefix=f".{file.name}.", suffix=".part")
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8", newline="\n") as out:
-            out.write(content)
-            out.flush()
-            os.fsync(out.fileno())
-        # mkstemp makes files for the owner alone; a recording is an ordinary file.
-        mask = os.umask(0)
-        os.umask(mask)
-        os.chmod(temporary, 0o666 & ~mask)
-        os.replace(temporary, file)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    write_text(file, content)

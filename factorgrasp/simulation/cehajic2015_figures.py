@@ -23,8 +23,14 @@ if TYPE_CHECKING:
 Motion: TypeAlias = Literal["printed", "exciting"]
 MOTIONS: tuple[Motion, ...] = ("printed", "exciting")
 
-EstimateHistory: TypeAlias = tuple[npt.ArrayLike, npt.ArrayLike, npt.ArrayLike]
-"""Times (k,) in s, quaternions [w, x, y, z] (k, 4) of ``R_r_h``, and ``p_r_h`` (k, 3) in m."""
+EstimateHistory: TypeAlias = (
+    tuple[npt.ArrayLike, npt.ArrayLike, npt.ArrayLike]
+    | tuple[npt.ArrayLike, npt.ArrayLike, npt.ArrayLike, npt.ArrayLike]
+)
+"""Times (k,) in s, quaternions [w, x, y, z] (k, 4) of ``R_r_h``, and ``p_r_h`` (k, 3) in m.
+
+From an estimator that states one also its covariance (k, 6, 6), order [rotation; translation], rad and m.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +49,8 @@ class ErrorCurve:
         ``|r_i - r_hat_i|`` (m).
     status : str
         Of the estimator.
+    quaternion_band, translation_band : ndarray, shape (k, 2), or None
+        Where ``|q - q_hat|`` and ``|r - r_hat|`` (m) lie with 95 % probability if the stated covariance is right.
     """
 
     t: FloatArray
@@ -50,6 +58,8 @@ class ErrorCurve:
     angle: FloatArray
     translation_error: FloatArray
     status: str = "completed"
+    quaternion_band: FloatArray | None = None
+    translation_band: FloatArray | None = None
 
     @property
     def quaternion_norm(self) -> FloatArray:
@@ -112,19 +122,47 @@ def excitation_gramian(motion: RigidMotion) -> FloatArray:
 
 def error_curve(recording: GraspRecording, history: EstimateHistory, status: str = "completed") -> ErrorCurve:
     """Compare a history of estimates with the grasp that was true at each time."""
-    t, q, r = (np.asarray(part, dtype=np.float64) for part in history)
+    t, q, r = (np.asarray(part, dtype=np.float64) for part in history[:3])
     true_R, true_r = recording.truth.grasp_at(t)
     true_q = np.broadcast_to(recording.truth.rotation_wxyz, q.shape)
     if recording.truth.changes:
         true_q = matrix_to_quaternion_wxyz(true_R)
     nearer = np.where(np.einsum("ni,ni->n", q, true_q) < 0.0, -1.0, 1.0)[:, None]
+    turned = moved = None
+    if len(history) == 4:
+        covariance = np.asarray(history[3], dtype=np.float64)
+        # A small rotation by an angle changes the unit quaternion by half of it.
+        turned = 0.5 * norm_band(covariance[:, :3, :3])
+        moved = norm_band(covariance[:, 3:, 3:])
     return ErrorCurve(
         t,
         np.abs(nearer * q - true_q),
         angle_between(true_R, quaternion_wxyz_to_matrix(q)),
         np.abs(r - true_r),
         status,
+        turned,
+        moved,
     )
+
+
+def norm_band(covariance: FloatArray, probability: float = 0.95) -> FloatArray:
+    """Where the norm of a zero-mean Gaussian vector lies, by its quantiles over 20 000 fixed draws.
+
+    Parameters
+    ----------
+    covariance : ndarray, shape (k, n, n)
+    probability : float
+        Of lying inside; as much is left out below as above.
+
+    Returns
+    -------
+    ndarray, shape (k, 2)
+        Lower and upper end.
+    """
+    variances = np.maximum(np.linalg.eigvalsh(covariance), 0.0)
+    squares = np.random.default_rng(0).standard_normal((20000, covariance.shape[-1])) ** 2
+    ends = np.array([0.5 - 0.5 * probability, 0.5 + 0.5 * probability])
+    return np.asarray(np.sqrt(np.quantile(squares @ variances.T, ends, axis=0)).T)
 
 
 def _run(recording: GraspRecording, seed: int, literal: bool) -> CehajicResult:
@@ -178,7 +216,7 @@ def reproduce_fig4(
         s.
     extra_curves : mapping, optional
         Label to a function that estimates the grasp from a recording, to be drawn beside the paper's: it returns times, quaternions
-        [w, x, y, z] and translations (see :data:`EstimateHistory`).
+        [w, x, y, z] and translations, and its covariances where it states them (see :data:`EstimateHistory`).
 
     Returns
     -------
@@ -206,8 +244,9 @@ def reproduce_fig4(
 
 _CORRECTED = "paper, formulas corrected"
 _LITERAL = "paper, as printed"
-_COLOURS = ("#1b6ca8", "#8a8a8a", "#c8553d", "#3b8f5a", "#8e5ea2", "#b8860b")
-_COMPONENTS = {_CORRECTED: "#9cc3e0"}
+_COLOURS = ("#2d69c4", "#9aa3ae", "#c2473d", "#2c8a57", "#8e5ea2", "#b8791a")
+_COMPONENTS = {_CORRECTED: "#a9c4ec"}
+_FEW_POINTS = 100
 
 
 def draw_fig4(data: Fig4, path: str | os.PathLike[str]) -> None:
@@ -215,7 +254,7 @@ def draw_fig4(data: Fig4, path: str | os.PathLike[str]) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(10.0, 6.4), layout="constrained")
+    figure = Figure(figsize=(10.0, 6.6), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(2, 2, sharex=True, sharey="row")
     for column, motion in enumerate(MOTIONS):
@@ -227,6 +266,7 @@ def draw_fig4(data: Fig4, path: str | os.PathLike[str]) -> None:
         above.set_title(
             f"{_TITLES[motion]}\nexcitation eigenvalues over the run: {eigenvalues} s$^{{-3}}$",
             fontsize=10,
+            loc="left",
         )
         for colour, (label, curve) in zip(_COLOURS, data.curves[motion].items(), strict=False):
             _draw_curve(above, below, curve, label, colour)
@@ -238,10 +278,10 @@ def draw_fig4(data: Fig4, path: str | os.PathLike[str]) -> None:
     axes[0][0].set_yscale("log")
     axes[0][0].set_ylim(1e-5, 3.0)
     axes[1][0].set_yscale("log")
-    axes[1][0].set_ylim(1e-4, 1e3)
+    axes[1][0].set_ylim(3e-5, 1e3)
     handles, labels = axes[1][0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 5), frameon=False)
-    figure.savefig(os.fspath(path), dpi=150)
+    figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False)
+    figure.savefig(os.fspath(path), dpi=120)
 
 
 _TITLES: dict[Motion, str] = {
@@ -251,18 +291,21 @@ _TITLES: dict[Motion, str] = {
 
 
 def _draw_curve(above: Axes, below: Axes, curve: ErrorCurve, label: str, colour: str) -> None:
-    every = slice(None, None, max(1, curve.t.size // 3000))
+    # As printed the orientation jumps with every sample: few points, thin and behind, or it would hide all the rest.
+    wild = label == _LITERAL
+    every = slice(None, None, max(1, curve.t.size // (600 if wild else 2400)))
     t = curve.t[every]
     if label in _COMPONENTS:
         light = _COMPONENTS[label]
         above.plot(t, curve.quaternion_error[every], color=light, linewidth=0.5)
         lines = below.plot(t, curve.translation_error[every], color=light, linewidth=0.5)
         lines[0].set_label("its components")
-    # As printed the orientation jumps with every sample: thin and behind, or it would hide all the rest.
-    wild = label == _LITERAL
+    marker = "o" if t.size <= _FEW_POINTS else ""
     above.plot(
         t,
         curve.quaternion_norm[every],
+        marker=marker,
+        markersize=2.5,
         color=colour,
         linewidth=0.3 if wild else 1.4,
         zorder=0.5 if wild else 3,
@@ -271,11 +314,21 @@ def _draw_curve(above: Axes, below: Axes, curve: ErrorCurve, label: str, colour:
         t,
         curve.translation_norm[every],
         ":" if wild else "-",
+        marker=marker,
+        markersize=2.5,
         color=colour,
-        linewidth=1.8,
+        linewidth=1.8 if wild else 1.4,
         label=label,
         zorder=3,
     )
+    for axes, band, name in (
+        (above, curve.quaternion_band, ""),
+        (below, curve.translation_band, "95 % band of its own covariance"),
+    ):
+        if band is not None:
+            low, high = band[every].T
+            axes.fill_between(t, low, high, color=colour, alpha=0.18, linewidth=0.0, label=name, zorder=2)
     for axes in (above, below):
         axes.grid(True, color="0.9", linewidth=0.6)
         axes.set_axisbelow(True)
+        axes.spines[["top", "right"]].set_visible(False)

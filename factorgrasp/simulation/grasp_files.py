@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import json
-import os
-import tempfile
 from dataclasses import asdict
+from os import PathLike
 from pathlib import Path
 
 import numpy as np
 
+from factorgrasp.atomic import write_text
 from factorgrasp.recordings.csv import write_csv
 from factorgrasp.simulation.grasp import GraspRecording, GraspTruth
 from factorgrasp.typing import JsonDict
 
 
-def write_recording(recording: GraspRecording, directory: str | os.PathLike[str]) -> Path:
+def write_recording(recording: GraspRecording, directory: str | PathLike[str]) -> Path:
     """Write ``robot.csv``, ``imu.csv``, ``truth.json`` and ``grasp.toml``, each atomically.
 
     The tables have the columns of :mod:`factorgrasp.recordings.csv`, in SI units.
@@ -36,11 +36,11 @@ def write_recording(recording: GraspRecording, directory: str | os.PathLike[str]
     folder.mkdir(parents=True, exist_ok=True)
     write_csv(folder / "robot.csv", recording.robot)
     write_csv(folder / "imu.csv", recording.hand)
-    _write(folder / "truth.json", json.dumps(_truth(recording), indent=2) + "\n")
+    write_text(folder / "truth.json", json.dumps(_truth(recording), indent=2) + "\n")
     gravity = ", ".join(repr(float(g)) for g in recording.gravity)
     # Written last: whoever finds it finds the rest.
     target = folder / "grasp.toml"
-    _write(
+    write_text(
         target,
         f"# Simulated: {recording.name}. The truth is in truth.json.\n"
         'kind = "grasp_pose"\n\n'
@@ -48,21 +48,6 @@ def write_recording(recording: GraspRecording, directory: str | os.PathLike[str]
         '[hand]\nfile = "imu.csv"\n',
     )
     return target
-
-
-def _write(path: Path, text: str) -> None:
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(text)
-        # mkstemp makes private files; these are meant to be shared like any other.
-        umask = os.umask(0)
-        os.umask(umask)
-        os.chmod(temporary, 0o666 & ~umask)
-        os.replace(temporary, path)
-    except BaseException:
-        os.unlink(temporary)
-        raise
 
 
 def _truth(recording: GraspRecording) -> JsonDict:

@@ -14,6 +14,7 @@ def body(floating: bool = True, kinds: str = "ball") -> Any:
     """A pinocchio model: pelvis, trunk, thighs, shanks, feet, arms; `kinds` "ball" or "hinges" (three hinges through massless links)."""
     pin = pytest.importorskip("pinocchio")
     model = pin.Model()
+    model.gravity.linear = np.array([0.0, 0.0, -9.80665])
     rng = np.random.default_rng(5)
     root = 0
     if floating:

@@ -280,6 +280,9 @@ def test_bad_input_names_the_field(recording):
     degrees = ImuStream(hand.t, np.rad2deg(hand.angular_velocity), hand.specific_force, check_units=False)
     with pytest.raises(InputError, match=r"hand angular velocity.*degrees suspected"):
         GraspPose(robot, degrees)
+    fast = ImuStream(hand.t, 1.6 * hand.angular_velocity, hand.specific_force)
+    with pytest.raises(InputError, match=r"hand angular velocity.*1\.6 times"):
+        GraspPose(robot, fast)
     with pytest.raises(InputError, match="overlap"):
         GraspPose(robot, hand.shifted(500.0))
     with pytest.raises(InputError, match="gravity"):
@@ -299,9 +302,31 @@ def test_bad_input_names_the_field(recording):
     with pytest.raises(InputError, match="at least 16 samples"):
         GraspPose(robot.slice(0.0, 0.02), hand)
     torn = robot.specific_force.copy()
-    torn[::150] = np.nan
+    torn[::20] = np.nan
     with pytest.raises(InputError, match="at least two common windows"):
         GraspPose(replace(robot, specific_force=torn), hand)
+
+
+def slow_poses(**options):
+    robot = RobotSensing(output="pose", rate=200.0, position_sd=1e-4, rotation_sd=1e-4)
+    return cehajic2015(seed=6, robot=robot, **options)
+
+
+def test_dense_gaps_shorten_the_windows():
+    run = slow_poses(duration=30.0)
+    torn = run.hand.angular_velocity.copy()
+    torn[np.random.default_rng(0).random(torn.shape[0]) < 0.003] = np.nan
+    found = solve(GraspPose(run.robot, ImuStream(run.hand.t, torn, run.hand.specific_force)))
+    assert found.status is Status.SOLVED
+    assert found.diagnostics.window_seconds < 0.6
+    assert nees(grasp_error(found, run.truth), found.covariance) < 6 * 3.0
+
+
+def test_gravity_of_the_wrong_sign_is_suspected():
+    run = slow_poses(duration=20.0)
+    found = solve(GraspPose(run.robot, run.hand, gravity=(0.0, 0.0, 9.80665)))
+    assert found.status is not Status.SOLVED
+    assert "gravity" in found.message
 
 
 def test_every_solver_gives_the_same_answer(recording, estimate):

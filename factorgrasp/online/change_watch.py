@@ -1,0 +1,183 @@
+"""Watches the estimate for a change of the grasp: keeps what the jump detector needs, and says when, how far and how a change went."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from factorgrasp.online.coupled_rows import ACCELEROMETER, GYRO, shift_hand
+from factorgrasp.online.fitter import GraspFitter, columns_of
+from factorgrasp.online.jump_detector import GRASP, STARTS, Jump, JumpDetector
+from factorgrasp.online.moment_solver import data_normal, local, retract
+from factorgrasp.online.row_history import RowHistory
+from factorgrasp.problems.grasp_model import GraspModel
+from factorgrasp.typing import FloatArray, State
+
+# A drift is told from a jump by this much evidence, and lasts at least so many segments.
+_SLIP_EVIDENCE = 3.0
+_SHORTEST_SLIP = 8
+# A reference this far (tangent step) from the estimate before makes its snapshots worthless.
+_FAR = 0.2
+
+
+@dataclass(frozen=True)
+class DetectorSettings:
+    """When a change of the grasp is reported.
+
+    Attributes
+    ----------
+    log_bayes_factor : float
+        Evidence that is needed.
+    smallest_angle, smallest_distance : float
+        rad and m; a change that is smaller in both is not reported.
+    """
+
+    log_bayes_factor: float = 15.0
+    smallest_angle: float = float(np.deg2rad(0.5))
+    smallest_distance: float = 0.005
+
+
+@dataclass(frozen=True)
+class Change:
+    """A change of the grasp that was found.
+
+    Attributes
+    ----------
+    kind : {"regrasp", "slip"}
+    time : float
+        When it began (s, robot clock).
+    rows : int
+        Newest rows that belong to the grasp after.
+    before : State
+    before_covariance : (n, n) ndarray
+        Estimate from data before the change.
+    jump : Jump
+    """
+
+    kind: Literal["regrasp", "slip"]
+    time: float
+    rows: int
+    before: State
+    before_covariance: FloatArray
+    jump: Jump
+
+
+class ChangeWatch:
+    """Segments since a few seconds, and the test on them.
+
+    Parameters
+    ----------
+    fitter : GraspFitter
+    segment : int
+        Rows between segments.
+    columns : int
+        Of one row.
+    settings : DetectorSettings
+    """
+
+    def __init__(self, fitter: GraspFitter, segment: int, columns: int, settings: DetectorSettings) -> None:
+        self._fitter, self._segment, self._settings = fitter, segment, settings
+        self._coefficients = RowHistory(STARTS[-1] + 1, fitter.short.bank.windowing.bins * 2 * columns)
+        self._reference: State | None = None
+        self._model: GraspModel = fitter.model
+        self._detector = JumpDetector(fitter.model.size)
+
+    def add(self, rows: RowHistory) -> None:
+        """A segment is complete: the newest window of two segment lengths."""
+        c = self._fitter.short.bank.coefficients(rows.last(2 * self._segment))
+        self._coefficients.append(rows.last_times(1), c.reshape(1, -1), False)
+        if self._reference is not None:
+            self._give_segments(1)
+
+    def remember(self, time: float) -> None:
+        """Keep the estimate as what was known at `time`."""
+        fit = self._fitter.fit
+        if fit is None:
+            return
+        if self._reference is None:
+            self.refer()
+        assert self._reference is not None
+        self._detector.add_snapshot(time, local(self._model, self._reference, fit.state), self._fitter.covariance())
+
+    def refer(self) -> None:
+        """Linearise at the present estimate, with its model and its weights."""
+        fit = self._fitter.fit
+        assert fit is not None
+        if fit.model is not self._model:
+            precision = np.diag(self._fitter.prior.information)
+            where = columns_of(fit.model, tuple(v.name for v in self._model.variables))
+            self._detector = self._detector.widened(where, fit.model.size, 1.0 / precision)
+            self._model = fit.model
+        if self._reference is not None:
+            shift = local(self._model, {**fit.state, **self._reference}, fit.state)
+            self._detector.move(shift)
+            if np.linalg.norm(shift[:GRASP]) > _FAR:
+                self._detector.forget()
+        self._reference = fit.state
+        self._detector.forget_segments()
+        self._give_segments(self._coefficients.kept)
+
+    def shift_clock(self, shift: float) -> None:
+        """The hand is read later by `shift` (s) from now on."""
+        count = self._coefficients.kept
+        short = self._fitter.short.bank
+        shift_hand(self._coefficients.last(count).reshape(count, short.windowing.bins, 2, -1), shift)
+        if self._reference is not None and "time_offset" in self._reference:
+            self._reference = {**self._reference, "time_offset": self._reference["time_offset"] - shift}
+
+    def restart(self, segments: int) -> None:
+        """Another grasp, of which the newest `segments` are."""
+        self._coefficients.run = max(min(self._coefficients.kept, segments), 0)
+        self._detector.forget()
+        self._reference = None
+
+    def find(self, rows: RowHistory) -> Change | None:
+        """A change of the grasp in the newest segments."""
+        jumps = self._detector.jumps()
+        best = max(jumps, key=lambda jump: jump.log_bayes_factor, default=None)
+        if best is None or best.log_bayes_factor < self._settings.log_bayes_factor:
+            return None
+        angle, distance = np.linalg.norm(best.step[:3]), np.linalg.norm(best.step[3:])
+        if angle < self._settings.smallest_angle and distance < self._settings.smallest_distance:
+            return None
+        drift = max(self._detector.ramps(), key=lambda jump: jump.log_bayes_factor)
+        if drift.segments >= _SHORTEST_SLIP and drift.log_bayes_factor > best.log_bayes_factor + _SLIP_EVIDENCE:
+            time, state, covariance = self._before(drift)
+            kept = max(best.segments // 2, 1) * self._segment
+            return Change("slip", time, kept, state, covariance, drift)
+        _, state, covariance = self._before(best)
+        kept = self._since(rows, best, state)
+        return Change("regrasp", float(rows.last_times(kept + 1)[0]), kept, state, covariance, best)
+
+    def _give_segments(self, count: int) -> None:
+        assert self._reference is not None
+        if count == 0:
+            return
+        short = self._fitter.short
+        c = self._coefficients.last(count).reshape(count, short.bank.windowing.bins, 2, -1)
+        Z_g, Z_a = short.segment_moments(c[..., GYRO], c[..., ACCELEROMETER])
+        residuals = short.residuals
+        for time, gyro, accelerometer in zip(self._coefficients.last_times(count), Z_g, Z_a, strict=True):
+            normal = data_normal(self._model, self._reference, gyro, accelerometer)
+            self._detector.add_segment(float(time), *normal, residuals)
+
+    def _before(self, jump: Jump) -> tuple[float, State, FloatArray]:
+        assert self._reference is not None
+        time, mean, covariance = self._detector.snapshot(jump.segments)
+        return time, retract(self._model, self._reference, mean), covariance
+
+    def _since(self, rows: RowHistory, jump: Jump, before: State) -> int:
+        """How many of the newest rows fit the grasp after better than the one before."""
+        after = retract(self._model, before, np.concatenate([jump.step, np.zeros(self._model.size - GRASP)]))
+        first = (jump.segments + 2) * self._segment
+        z = rows.last(min(first, rows.kept))
+        gain = np.zeros(z.shape[0])
+        for part, L_before, L_after in zip((GYRO, ACCELEROMETER), self._model.matrices(before), self._model.matrices(after), strict=True):
+            e_before = np.sum((z[:, part] @ L_before.T) ** 2, axis=1)
+            e_after = np.sum((z[:, part] @ L_after.T) ** 2, axis=1)
+            gain += (e_before - e_after) / max(float(np.mean(e_before[: self._segment])), 1e-300)
+        # The best split: rows after it speak for the new grasp, rows before it for the old one.
+        total = np.cumsum(gain[::-1])
+        return int(np.clip(np.argmax(total) + 1, 1, (jump.segments + 1) * self._segment))

@@ -1,0 +1,337 @@
+"""Grasp pose from two live streams: the batch problem's terms in constant memory, with regrasps and slips detected."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from factorgrasp.errors import InputError
+from factorgrasp.online.change_watch import DetectorSettings
+from factorgrasp.online.clock_start import Setup, analyse, coupler, enough, feed
+from factorgrasp.online.coupled_rows import Coupler
+from factorgrasp.online.estimate import OnlineGraspEstimate, StreamCounts
+from factorgrasp.online.events import GraspEvent
+from factorgrasp.online.robot_feed import COLUMNS, RobotFeed, RobotKind
+from factorgrasp.online.sample_buffer import SampleBuffer
+from factorgrasp.online.tracker import GraspTracker
+from factorgrasp.problems import grasp_words
+from factorgrasp.problems.grasp_recording import SMALLEST_CORRELATION
+from factorgrasp.problems.grasp_settings import GraspNoise, GraspPrior, GraspSettings
+from factorgrasp.problems.grasp_system import checked_gravity
+from factorgrasp.status import Status
+from factorgrasp.typing import FloatArray
+
+# s; the first seconds are looked at again after this much more data while they do not show the clocks' offset.
+_RETRY = 0.5
+# s; the offset found in the first seconds is applied and they are read again until it moves by less than this.
+_SETTLED_START = 2e-4
+_MOST_PASSES = 4
+# A quaternion shorter than 1 by more than this was interpolated across a change of sign: a gap. A longer one is something else.
+_QUATERNION_TOLERANCE = 1e-2
+
+
+class OnlineGraspPose:
+    """Estimates the grasp pose while robot and hand move, from samples as they come.
+
+    Feed both sides with :meth:`add_robot` and :meth:`add_hand`, sample by sample or in chunks, each on its own clock; ask :meth:`estimate` whenever it
+    is wanted. Rates up to some kHz; memory does not grow.
+
+    Parameters
+    ----------
+    noise : GraspNoise
+    settings : GraspSettings
+        As for the batch problem. ``forgetting_time`` follows slow drifts (of the clocks, too).
+    gravity : (3,) array_like
+        In the robot's world frame, m/s^2.
+    prior : GraspPrior
+    lateness : float
+        s; samples may come late, and out of order, by this much against the newest of their own stream. Where a stamp is missing the rows
+        behind it wait this long; what comes later still is dropped and counted.
+    detector : DetectorSettings or None
+        When a regrasp or a slip is reported; None: never looked for.
+    start_seconds : float
+        s; first data from which rates, noise and the clocks' offset are taken. Longer where the motion begins later.
+    buffer_seconds : float
+        s; one stream may be ahead of the other by so much, clock offset included.
+    block : float
+        s; new data enter the estimate in blocks of about this length.
+
+    Raises
+    ------
+    InputError
+        On bad arguments; and from :meth:`add_robot` or :meth:`add_hand` on samples of the wrong shape, or with units that cannot be right.
+
+    Notes
+    -----
+    Lag of the newest data: two hand samples, one block, two rows of z (10 ms), and for poses half the differentiation window (about 20 ms at 40 Hz).
+    Newest data count fully only after half an analysis window (0.5 s); the change detector sees them within 0.1 s.
+    """
+
+    def __init__(
+        self,
+        noise: GraspNoise | None = None,
+        settings: GraspSettings | None = None,
+        gravity: Sequence[float] | FloatArray = (0.0, 0.0, -9.80665),
+        prior: GraspPrior | None = None,
+        *,
+        lateness: float = 0.2,
+        detector: DetectorSettings | None = DetectorSettings(),
+        start_seconds: float = 3.0,
+        buffer_seconds: float = 10.0,
+        block: float = 0.02,
+    ) -> None:
+        self.noise, self.settings = noise or GraspNoise(), settings or GraspSettings()
+        self.prior, self.gravity = prior or GraspPrior(), checked_gravity(gravity)
+        for name, value in (("start_seconds", start_seconds), ("buffer_seconds", buffer_seconds), ("block", block)):
+            if not (np.isfinite(value) and value > 0.0):
+                raise InputError(name, "a finite number of seconds above zero", repr(value))
+        if not (np.isfinite(lateness) and lateness >= 0.0):
+            raise InputError("lateness", "a finite number of seconds, zero or more", repr(lateness))
+        ahead = self.settings.max_time_offset + abs(self.settings.time_offset_guess)
+        if buffer_seconds < start_seconds + ahead + lateness:
+            raise InputError(
+                "buffer_seconds",
+                f"at least start_seconds + max_time_offset + |time_offset_guess| + lateness = {start_seconds + ahead + lateness:g} s",
+                repr(buffer_seconds),
+            )
+        self._lateness, self._keep, self._start_seconds, self._block = lateness, buffer_seconds, start_seconds, block
+        self._detector = detector
+        self._kind: RobotKind | None = None
+        self._robot: SampleBuffer | None = None
+        self._hand = SampleBuffer(6, lateness, buffer_seconds)
+        self._next_try = -np.inf
+        self._setup: Setup | None = None
+        self._feed: RobotFeed | None = None
+        self._coupler: Coupler | None = None
+        self._tracker: GraspTracker | None = None
+        self._offset = 0.0
+        self._correlation = 0.0
+
+    # ---- samples in --------------------------------------------------------------------------------------
+
+    def add_robot(
+        self,
+        t: npt.ArrayLike,
+        position: npt.ArrayLike | None = None,
+        rotation_wxyz: npt.ArrayLike | None = None,
+        *,
+        angular_velocity: npt.ArrayLike | None = None,
+        angular_acceleration: npt.ArrayLike | None = None,
+        specific_force: npt.ArrayLike | None = None,
+    ) -> None:
+        """Take one sample of the robot's end-effector or a chunk of them, always of the same kind.
+
+        Parameters
+        ----------
+        t : float or (m,) array_like
+            s, robot clock.
+        position, rotation_wxyz : (3,) or (m, 3); (4,) or (m, 4) array_like
+            Poses: ``p_w_r`` (m) and ``R_w_r`` as unit quaternion [w, x, y, z].
+        angular_velocity, angular_acceleration, specific_force : (3,) or (m, 3) array_like
+            Motion in the end-effector frame (rad/s, rad/s^2, m/s^2); without the acceleration, an IMU that defines that frame. `rotation_wxyz` with
+            motion is used for the base tilt only.
+        """
+        if angular_velocity is None:
+            kind: RobotKind = "poses"
+            parts = [("position", position, 3), ("rotation_wxyz", rotation_wxyz, 4)]
+        else:
+            kind = "imu" if angular_acceleration is None else "motion"
+            parts = [("angular_velocity", angular_velocity, 3)]
+            if kind == "motion":
+                parts.append(("angular_acceleration", angular_acceleration, 3))
+            parts.append(("specific_force", specific_force, 3))
+            if self.settings.base_tilt:
+                parts.append(("rotation_wxyz", rotation_wxyz, 4))
+        if self._kind is None:
+            if kind == "imu" and self.settings.base_tilt:
+                raise InputError("settings.base_tilt", "a robot stream with orientations", "an IMU on the robot")
+            self._kind = kind
+            extra = 4 if kind == "motion" and self.settings.base_tilt else 0
+            self._robot = SampleBuffer(COLUMNS[kind] + extra, self._lateness, self._keep)
+        if kind != self._kind:
+            raise InputError("robot", f"{self._kind} as in the first sample", kind)
+        assert self._robot is not None
+        stamps = _stamps(t, "robot.t")
+        rows = [_rows(value, f"robot.{name}", stamps.size, width) for name, value, width in parts]
+        if rows[-1].shape[1] == 4:
+            rows[-1] = _quaternions(rows[-1], "robot.rotation_wxyz")
+        self._robot.add(stamps, np.hstack(rows))
+        self._advance()
+
+    def add_hand(self, t: npt.ArrayLike, angular_velocity: npt.ArrayLike, specific_force: npt.ArrayLike) -> None:
+        """Take one sample of the IMU on the hand or a chunk of them.
+
+        Parameters
+        ----------
+        t : float or (m,) array_like
+            s, hand clock.
+        angular_velocity, specific_force : (3,) or (m, 3) array_like
+            rad/s and m/s^2, in the sensor's frame.
+        """
+        stamps = _stamps(t, "hand.t")
+        rate = _rows(angular_velocity, "hand.angular_velocity", stamps.size, 3)
+        force = _rows(specific_force, "hand.specific_force", stamps.size, 3)
+        self._hand.add(stamps, np.hstack([rate, force]))
+        self._advance()
+
+    # ---- answers out -------------------------------------------------------------------------------------
+
+    @property
+    def events(self) -> tuple[GraspEvent, ...]:
+        """Regrasps and slips so far, oldest first."""
+        return () if self._tracker is None else self._tracker.events
+
+    @property
+    def started(self) -> bool:
+        """Whether the first seconds have shown rates and clocks, so that estimates come."""
+        return self._tracker is not None
+
+    def estimate(self) -> OnlineGraspEstimate:
+        """What is known of the grasp with all data so far."""
+        tracker = self._tracker
+        fit = None if tracker is None else tracker.solve()
+        counts = self._counts()
+        if tracker is None or fit is None:
+            nothing = np.full(3, np.nan)
+            unknown = np.full(3, np.inf)
+            return OnlineGraspEstimate(
+                np.nan if tracker is None else tracker.time,
+                Status.UNOBSERVABLE,
+                self._waiting(),
+                np.full((3, 3), np.nan),
+                nothing,
+                np.diag(np.full(6, np.inf)),
+                self._offset if self.started else np.nan,
+                self.noise.time_offset_sd if self.settings.time_offset else 0.0,
+                nothing,
+                unknown,
+                nothing,
+                unknown,
+                0.0 if tracker is None else tracker.seconds,
+                self.events,
+                *counts,
+            )
+        model, state, full = fit.model, fit.state, tracker.fitter.covariance()
+        where, sd = model.columns, np.sqrt(np.diag(full))
+
+        def known(name: str, size: int) -> tuple[FloatArray, FloatArray]:
+            return (state[name], sd[where[name]]) if name in where else (np.zeros(size), np.zeros(size))
+
+        offset, offset_sd = known("time_offset", 1)
+        rotation, translation = full[:3, :3], full[3:6, 3:6]
+        resolved = (
+            np.linalg.eigvalsh(rotation)[-1] <= self.settings.rotation_resolution**2
+            and np.linalg.eigvalsh(translation)[-1] <= self.settings.translation_resolution**2
+        )
+        out = OnlineGraspEstimate(
+            tracker.time,
+            Status.SOLVED if resolved else Status.UNOBSERVABLE,
+            "" if resolved else self._missing(tracker),
+            state["rotation"],
+            state["translation"],
+            full[:6, :6],
+            self._offset + float(offset[0]),
+            float(offset_sd[0]),
+            *known("gyro_bias", 3),
+            *known("accelerometer_bias", 3),
+            tracker.seconds,
+            self.events,
+            *counts,
+            model,
+            state,
+            full,
+            tracker.rate_moment,
+        )
+        return out
+
+    def _missing(self, tracker: GraspTracker) -> str:
+        return "The motion has not shown all of the grasp yet. " + grasp_words.advice(tracker.rate_moment, None)
+
+    def _waiting(self) -> str:
+        if self._robot is None or self._robot.received == 0:
+            return "No sample of the robot yet."
+        if self._hand.received == 0:
+            return "No sample of the hand yet."
+        if self._tracker is None:
+            if self._correlation > 0.0:
+                return (
+                    f"Robot and hand are not seen to turn together yet (correlation of their angular rates {self._correlation:.2f} at the best "
+                    "offset): move the object about changing axes."
+                )
+            return f"Waiting for {self._start_seconds:g} s of both streams."
+        return "Too little data of this grasp yet."
+
+    def _counts(self) -> tuple[StreamCounts, StreamCounts]:
+        robot, hand = self._robot, self._hand
+        cutter = None if self._feed is None else self._feed.cutter
+        lost = 0 if self._coupler is None else self._coupler.overflown
+        return (
+            StreamCounts()
+            if robot is None
+            else StreamCounts(
+                robot.received,
+                robot.late,
+                robot.duplicates,
+                0 if cutter is None else cutter.incomplete,
+                0 if cutter is None else cutter.gaps,
+                robot.overflown + lost,
+            ),
+            StreamCounts(
+                hand.received,
+                hand.late,
+                hand.duplicates,
+                0 if self._coupler is None else self._coupler.hand.incomplete,
+                0 if self._coupler is None else self._coupler.hand.gaps,
+                hand.overflown,
+            ),
+        )
+
+    # ---- internals ---------------------------------------------------------------------------------------
+
+    def _advance(self) -> None:
+        if self._tracker is None:
+            self._try_start()
+        elif self._robot is not None and self._feed is not None and self._coupler is not None:
+            t, x = self._robot.settled()
+            if t.size >= self._batch:
+                self._coupler.push(self._feed.push(t, x))
+                self._robot.release(t.size)
+            for piece in self._coupler.pull(self._offset):
+                self._tracker.take(piece)
+            self._follow_clock()
+
+    def _follow_clock(self) -> None:
+        assert self._tracker is not None
+        self._offset += self._tracker.clock_shift
+        self._tracker.clock_shift = 0.0
+
+    def _try_start(self) -> None:
+        """Start when the first seconds suffice."""
+        if self._robot is None or min(self._robot.newest, self._hand.newest) == -np.inf:
+            return
+        progress = self._robot.newest
+        if progress < self._next_try:
+            return
+        robot, hand = self._robot.everything(), self._hand.everything()
+        if not (enough(*robot, self._start_seconds) and enough(*hand, self._start_seconds)):
+            return
+        self._next_try = progress + _RETRY
+        assert self._kind is not None
+        setup = analyse(self._kind, robot, hand, self.noise, self.settings, self.gravity)
+        self._correlation = setup.clock.correlation
+        if setup.clock.correlation < SMALLEST_CORRELATION:
+            return
+        self._robot.start(setup.robot.step)
+        self._hand.start(setup.hand.step)
+        self._setup, self._offset = setup, setup.clock.offset
+        for _ in range(_MOST_PASSES):
+            if abs(self._read_start(setup)) < _SETTLED_START:
+                break
+        t, _ = self._robot.settled()
+        self._robot.release(t.size)
+
+    def _read_start(self, setup: Setup) -> float:
+        """Read the first seconds with the present offset; returns by how much (s) it was wrong."""
+        ...

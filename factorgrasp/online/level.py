@@ -1,0 +1,113 @@
+"""One kind of window with everything that weighs its bands: expected noise, residual power, trust."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from factorgrasp.online.moment_solver import Fit, Moment
+from factorgrasp.online.window_bank import WindowBank
+from factorgrasp.problems.grasp_kinematics import RobotNoise
+from factorgrasp.problems.grasp_noise import (
+    BandVariances,
+    NoiseMoments,
+    declared_variances,
+    estimated_variances,
+    noise_moments,
+)
+from factorgrasp.problems.grasp_settings import GraspNoise, GraspSettings
+from factorgrasp.problems.grasp_system import floored_inverse
+from factorgrasp.typing import FloatArray
+
+
+class Level:
+    """A bank of windows, its noise model and its band weights.
+
+    Parameters
+    ----------
+    bank : WindowBank
+    robot : RobotNoise
+        Densities at the bins' frequencies.
+    noise, settings : GraspNoise, GraspSettings
+    lever_arm : (3,) ndarray
+        m; a guess through which the robot's noise acts before anything is known.
+    """
+
+    def __init__(
+        self, bank: WindowBank, robot: RobotNoise, noise: GraspNoise, settings: GraspSettings, lever_arm: FloatArray
+    ) -> None:
+        self.bank = bank
+        self._robot, self._noise, self._settings = robot, noise, settings
+        self.expected = self._expect(np.zeros(3), np.zeros((3, 3)))
+        self.declared = declared_variances(self.expected, lever_arm)
+        self._lever_arm = lever_arm
+        self.variances = self.declared
+        self._fresh = True
+        self._median = [0.0, 0.0]
+        self._correct()
+
+    def _expect(self, mean_force: FloatArray, rate_moment: FloatArray) -> NoiseMoments:
+        bank = self.bank
+        return noise_moments(self._robot, self._noise, bank.windowing, mean_force, rate_moment, bank.width)
+
+    def _correct(self) -> None:
+        """Expected noise in the weighted sums, for one half-overlapping window."""
+        (w_g, w_a), dof = self.variances.weights, self.bank.windowing.dof
+        size = float(self._settings.errors_in_variables)
+        self._noise_g = size * np.tensordot(w_g * dof, self.expected.gyro, 1)
+        self._noise_a = size * np.tensordot(w_a * dof, self.expected.accelerometer, 1)
+
+    def moment(self) -> Moment:
+        """Weighted sums of all windows."""
+        bank, weights = self.bank, self.variances.weights
+        gyro, accelerometer = bank.weighted(weights)
+        squared = bank.weighted(weights, squared=True) if bank.squares else (gyro, accelerometer)
+        count = bank.weight
+        return Moment(gyro - count * self._noise_g, accelerometer - count * self._noise_a, *squared)
+
+    def segment_moments(self, c_g: FloatArray, c_a: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The same (N, 10, 10) and (N, m, m) of single windows with coefficients (N, K, 2, c)."""
+        out = []
+        for c, weight, noise in zip((c_g, c_a), self.variances.weights, (self._noise_g, self._noise_a), strict=True):
+            flat = c.reshape(c.shape[0], -1, c.shape[3])
+            out.append(np.matmul(flat.transpose(0, 2, 1) * np.repeat(weight, 2), flat) - noise)
+        return out[0], out[1]
+
+    def relative_power(self, sensor: int, power: FloatArray) -> FloatArray:
+        """Whitened residual power (N,) of single windows, from their power per bin (N, K), relative to its running median."""
+        total = power @ self.variances.weights[sensor]
+        for value in total:
+            # Stochastic approximation of the median: a step up or down of a few per cent.
+            if self._median[sensor] == 0.0:
+                self._median[sensor] = value
+            self._median[sensor] *= 1.03 if value > self._median[sensor] else 1.0 / 1.03
+        return np.asarray(total / max(self._median[sensor], 1e-300))
+
+    @property
+    def residuals(self) -> float:
+        """Independent numbers of one half-overlapping window in the bins that are used."""
+        dof = self.bank.windowing.dof
+        return float(3.0 * (dof.sum() + dof[self.variances.trusted].sum()))
+
+    def refresh(self, fit: Fit, mean_force: FloatArray, rate_moment: FloatArray) -> float:
+        """Estimate the residual power of every band anew; returns the largest relative change of a variance."""
+        self.expected = self._expect(mean_force, rate_moment)
+        if self._fresh:
+            self.declared = declared_variances(self.expected, self._lever_arm)
+        before = self.variances
+        self.variances = estimated_variances(
+            fit.model,
+            fit.state,
+            self.bank.moments(),
+            self.declared,
+            floored_inverse(fit.information),
+            before,
+            self._settings.adapt_noise,
+        )
+        self._correct()
+        return self.variances.change_from(before)
+
+    def restart(self) -> None:
+        """A new grasp: moments go, noise levels stay as what is known beforehand."""
+        self.bank.clear()
+        self.declared = BandVariances(self.variances.gyro, self.variances.accelerometer, np.ones_like(self.variances.trusted))
+        self._fresh = False

@@ -1,0 +1,276 @@
+"""From rows of z to the grasp: windows, solves and reviews in their rhythm, and a fresh start after a change."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from factorgrasp import lie
+from factorgrasp.losses import make_loss
+from factorgrasp.online.change_watch import Change, ChangeWatch, DetectorSettings
+from factorgrasp.online.coupled_rows import ACCELEROMETER, GYRO, row_width, shift_hand
+from factorgrasp.online.events import GraspEvent
+from factorgrasp.online.fitter import GraspFitter
+from factorgrasp.online.jump_detector import GRASP
+from factorgrasp.online.level import Level
+from factorgrasp.online.moment_solver import Fit, retract
+from factorgrasp.online.row_history import RowHistory
+from factorgrasp.online.stream_pieces import Piece
+from factorgrasp.online.window_bank import WindowBank
+from factorgrasp.problems.grasp_kinematics import RobotNoise
+from factorgrasp.problems.grasp_model import ACCELEROMETER_WIDTH, TILTED_WIDTH
+from factorgrasp.problems.grasp_settings import GraspNoise, GraspPrior, GraspSettings
+from factorgrasp.problems.grasp_windows import Windowing
+from factorgrasp.typing import FloatArray, State
+
+# s; the jump test looks at windows of twice this length, one every such time.
+SEGMENT = 0.1
+# Reviews of the weights: often while the estimate is young, then now and then (s of data).
+_YOUNG, _OFTEN, _SELDOM = 5.0, 0.5, 2.0
+# Other local optima are looked for within the first seconds only.
+_SURE = 20.0
+# A remaining clock offset above this (s) is applied to the data; the model is linear in what remains.
+_SETTLED_OFFSET = 1e-4
+# A change that is found this soon (s) after another one is the same one going on; if it goes on longer than that, the hand slips.
+_SAME_CHANGE = 3.0
+_MOST_EVENTS = 256
+
+
+class GraspTracker:
+    """Estimates the grasp from rows of z as they come.
+
+    Parameters
+    ----------
+    step : float
+        s, between rows.
+    bandwidth : float
+        Hz.
+    robot : callable
+        Frequencies (K,) in Hz to the densities of the robot's noise.
+    noise, settings, prior : GraspNoise, GraspSettings, GraspPrior
+    detector : DetectorSettings or None
+        None: changes are not looked for.
+    block : float
+        s; new data enter the estimate in blocks of about this length.
+    """
+
+    def __init__(
+        self,
+        step: float,
+        bandwidth: float,
+        robot: Callable[[FloatArray], RobotNoise],
+        noise: GraspNoise,
+        settings: GraspSettings,
+        prior: GraspPrior,
+        detector: DetectorSettings | None,
+        block: float,
+    ) -> None:
+        self.step = step
+        self.hop = max(1, round(block / step))
+        self.segment = self.hop * max(1, round(SEGMENT / (self.hop * step)))
+        self._loss = make_loss(settings.loss, settings.loss_scale)
+        width = TILTED_WIDTH if settings.base_tilt else ACCELEROMETER_WIDTH
+        half = max(2, round(0.5 * settings.window / step))
+        lever_arm = np.full(3, np.linalg.norm(prior.translation) or 0.5) / np.sqrt(3.0)
+
+        def level(length: int) -> Level:
+            windowing = Windowing(step, length, max(2, int(bandwidth * length * step + 1e-9) + 1))
+            bank = WindowBank(windowing, self.hop, width, settings.forgetting_time, self._loss is not None)
+            return Level(bank, robot(windowing.frequencies), noise, settings, lever_arm)
+
+        self.fitter = GraspFitter(level(2 * self.segment), level(2 * half), noise, settings, prior)
+        self.history = RowHistory(52 * self.segment + 2 * half, row_width(settings.base_tilt))
+        self._watch = None
+        if detector is not None:
+            self._watch = ChangeWatch(self.fitter, self.segment, row_width(settings.base_tilt), detector)
+        self._since_hop = self._since_segment = 0
+        self._events: deque[GraspEvent] = deque(maxlen=_MOST_EVENTS)
+        self._before: tuple[State, FloatArray] | None = None
+        self.event_count = 0
+        self.clock_shift = 0.0
+        """Offset (s) found since the last call of :meth:`apply_clock_shift`."""
+        self._begin()
+
+    def _begin(self) -> None:
+        self._rows = 0
+        self._force, self._rates = np.zeros(3), np.zeros((3, 3))
+        self._next_review = _OFTEN
+        self._pending = False
+
+    # ---- rows in -----------------------------------------------------------------------------------------
+
+    def take(self, piece: Piece) -> None:
+        """Take rows of z (m, c)."""
+        t, z, starts = piece
+        if starts:
+            self._since_hop = self._since_segment = 0
+        first = 0
+        while first < t.size:
+            count = min(t.size - first, self.segment - self._since_segment)
+            part = slice(first, first + count)
+            self.history.append(t[part], z[part], starts and first == 0)
+            self._count(z[part])
+            self._since_segment += count
+            hops, self._since_hop = divmod(self._since_hop + count, self.hop)
+            if hops:
+                self._slide(hops)
+            if self._since_segment == self.segment:
+                self._since_segment = 0
+                self._finish_segment()
+            first += count
+
+    def _count(self, z: FloatArray) -> None:
+        self._rows += z.shape[0]
+        self._force += z[:, 10:13].sum(axis=0)
+        self._rates += z[:, 0:3].T @ z[:, 0:3]
+
+    def _slide(self, hops: int) -> None:
+        """Windows that end with each of the last `hops` hops."""
+        self._pending = True
+        skip = self._since_hop
+        for level in (self.fitter.short, self.fitter.long):
+            bank = level.bank
+            wanted = (hops - 1) * self.hop + bank.windowing.length
+            usable = min(self.history.kept - skip, wanted)
+            if usable >= bank.windowing.length:
+                rows = self.history.last(usable + skip)[:usable]
+                coefficients = bank.coefficients(rows)
+                bank.add(coefficients, self._trust(level, coefficients))
+
+    def _trust(self, level: Level, coefficients: FloatArray) -> FloatArray | None:
+        """Robust weights (N,) of windows at insertion, by their whitened residuals."""
+        if self._loss is None:
+            return None
+        fit = self.fitter.fit
+        if fit is None:
+            return np.ones(coefficients.shape[0])
+        norm = np.zeros(coefficients.shape[0])
+        for k, (L, part) in enumerate(zip(fit.model.matrices(fit.state), (GYRO, ACCELEROMETER), strict=True)):
+            norm += 0.5 * level.relative_power(k, np.sum((coefficients[..., part] @ L.T) ** 2, axis=(2, 3)))
+        return np.asarray(self._loss.weight(np.sqrt(norm)))
+
+    # ---- the estimate ------------------------------------------------------------------------------------
+
+    @property
+    def time(self) -> float:
+        """Time of the newest row, s, robot clock."""
+        return float(self.history.last_times(1)[0]) if self.history.run else np.nan
+
+    @property
+    def seconds(self) -> float:
+        """Data of this grasp, s."""
+        return self._rows * self.step
+
+    @property
+    def rate_moment(self) -> FloatArray:
+        """Mean of ``w_r w_r'`` (3, 3) over this grasp."""
+        return self._rates / max(self._rows, 1)
+
+    def solve(self) -> Fit | None:
+        """The estimate with all windows so far."""
+        if self._pending:
+            self._pending = False
+            self.fitter.solve(self._force / max(self._rows, 1), self.rate_moment)
+        return self.fitter.fit
+
+    @property
+    def events(self) -> tuple[GraspEvent, ...]:
+        """Changes of the grasp so far, the last one with the best present knowledge of how far."""
+        if not self._events:
+            return ()
+        return (*list(self._events)[:-1], self._refined(self._events[-1]))
+
+    # ---- what is done now and then -----------------------------------------------------------------------
+
+    def _finish_segment(self) -> None:
+        if self.history.kept < 2 * self.segment:
+            return
+        if self._watch is not None:
+            self._watch.add(self.history)
+            change = self._watch.find(self.history)
+            if change is not None:
+                self._start_afresh(change)
+                return
+        if self.solve() is None:
+            return
+        if self.seconds >= self._next_review:
+            self._review()
+        if self._watch is not None:
+            self._watch.remember(self.time)
+
+    def _review(self) -> None:
+        self._next_review = self.seconds + (_OFTEN if self.seconds < _YOUNG else _SELDOM)
+        self.fitter.review(self.seconds < _SURE, self._force / self._rows, self.rate_moment)
+        fit = self.fitter.fit
+        assert fit is not None
+        shift = float(fit.state["time_offset"][0]) if "time_offset" in fit.state else 0.0
+        if abs(shift) > _SETTLED_OFFSET:
+            self.fitter.shift_clock(shift)
+            shift_hand(self.history.last(self.history.kept), shift)
+            if self._watch is not None:
+                self._watch.shift_clock(shift)
+            self.clock_shift += shift
+        if self._watch is not None:
+            self._watch.refer()
+
+    def _start_afresh(self, change: Change) -> None:
+        self._note(change)
+        step = _padded(change.jump.step, self.fitter.model.size)
+        self.fitter.restart(change.before, change.before_covariance, retract(self.fitter.model, change.before, step))
+        self._begin()
+        kept = min(change.rows, self.history.kept)
+        self.history.run = kept
+        self._count(self.history.last(kept) if kept else self.history.last(1)[:0])
+        assert self._watch is not None
+        self._watch.restart(kept // self.segment - 1)
+        if kept:
+            self._slide(max(kept // self.hop, 1))
+
+    def _note(self, change: Change) -> None:
+        """Put a change on record; one that follows another at once is that one, going on."""
+        now, last, jump = self.time, self._events[-1] if self._events else None, change.jump
+        if last is not None and self._before is not None and change.time - last.until < _SAME_CHANGE:
+            drifts = "slip" in (change.kind, last.kind) or now - last.time > _SAME_CHANGE
+            after = retract(self.fitter.model, change.before, _padded(jump.step, self.fitter.model.size))
+            self._events[-1] = replace(
+                last,
+                kind="slip" if drifts else "regrasp",
+                until=now,
+                step=_between(self._before[0], after),
+                covariance=jump.covariance + self._before[1],
+                log_bayes_factor=max(last.log_bayes_factor, jump.log_bayes_factor),
+            )
+            return
+        if last is not None:
+            self._events[-1] = self._refined(last)
+        self._before = (change.before, change.before_covariance[:GRASP, :GRASP])
+        self.event_count += 1
+        self._events.append(
+            GraspEvent(change.kind, change.time, now, now, jump.step, jump.covariance, jump.log_bayes_factor)
+        )
+
+    def _refined(self, event: GraspEvent) -> GraspEvent:
+        """The event with the difference between the estimates after and before, where that is known better."""
+        fit = self.fitter.fit
+        if fit is None or self._before is None:
+            return event
+        before, P = self._before
+        turn = np.eye(GRASP)
+        turn[:3, :3] = fit.state["rotation"].T @ before["rotation"]
+        covariance = turn @ P @ turn.T + self.fitter.covariance()[:GRASP, :GRASP]
+        if np.any(np.diag(covariance) > 4.0 * np.diag(event.covariance)):
+            return event
+        return replace(event, step=_between(before, fit.state), covariance=covariance)
+
+
+def _between(before: State, after: State) -> FloatArray:
+    """[rotation vector; translation] (6,) from one grasp to another."""
+    turn = lie.so3_log(before["rotation"].T @ after["rotation"])
+    return np.concatenate([turn, after["translation"] - before["translation"]])
+
+
+def _padded(step: FloatArray, size: int) -> FloatArray:
+    return np.concatenate([step, np.zeros(size - step.size)])

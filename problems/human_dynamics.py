@@ -1,0 +1,168 @@
+"""Human dynamics: joint torques, wrenches and accelerations of an articulated body as one maximum a posteriori estimate a frame.
+
+Model and unknowns: mathematics 4.1 (Latella 2018, Tirupachuri 2021). Newton-Euler, sensors and a prior are rows with covariances; torques are
+linear read-outs with theirs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from factorgrasp.errors import InputError
+from factorgrasp.estimate import Estimate
+from factorgrasp.least_squares import LeastSquares
+from factorgrasp.problems.human_dynamics_constraints import DynamicsConstraint
+from factorgrasp.problems.human_dynamics_estimate import HumanDynamicsEstimate, read_frames
+from factorgrasp.problems.human_dynamics_sensors import Sensor
+from factorgrasp.problems.human_dynamics_settings import HumanDynamicsNoise
+from factorgrasp.problems.human_dynamics_system import HumanDynamicsSystem
+from factorgrasp.problems.human_dynamics_whitening import Whitening
+from factorgrasp.problems.link_motion import LinkMotion
+from factorgrasp.typing import BoolArray, FloatArray, IntArray
+
+
+class HumanDynamics:
+    """The human-dynamics problem of one recording; solve it with :func:`factorgrasp.solvers.frames.solve_frames`.
+
+    Parameters
+    ----------
+    motion : LinkMotion
+        Fixed or floating base.
+    sensors : sequence of Sensor
+        Measurements at the frames of the motion; links without a wrench sensor that are not in `contacts` are taken to touch nothing.
+    noise : HumanDynamicsNoise
+    contacts : sequence of str
+        Links that may carry a wrench nobody measures (hands, seat, back).
+    constraints : sequence of DynamicsConstraint
+        Inequalities on wrenches and torques (mathematics 4.5); need a QP solver.
+    hard_dynamics : bool
+        Newton-Euler as equality constraints in place of rows with a variance.
+    use_motion : bool
+        Take the motion's own accelerations as measurements where no sensor gives them.
+
+    Raises
+    ------
+    InputError
+        Naming the sensor, link or variance that does not fit.
+    """
+
+    kind = "human_dynamics"
+
+    def __init__(
+        self,
+        motion: LinkMotion,
+        sensors: Sequence[Sensor] = (),
+        noise: HumanDynamicsNoise | None = None,
+        contacts: Sequence[str] = (),
+        constraints: Sequence[DynamicsConstraint] = (),
+        hard_dynamics: bool = False,
+        use_motion: bool = True,
+    ) -> None:
+        self.motion, self.sensors, self.constraints = motion, tuple(sensors), tuple(constraints)
+        count = len(motion)
+        for sensor in self.sensors:
+            if sensor.values.shape[0] != count:
+                raise InputError(sensor.name, f"values at the {count} frames of the motion", f"{sensor.values.shape[0]} rows")
+        rows = [constraint.row_pattern(motion.tree) for constraint in self.constraints]
+        self.system = HumanDynamicsSystem(motion.tree, self.sensors, noise, contacts, use_motion, hard_dynamics, rows)
+        self._whitening = Whitening(self.system, self.sensors)
+        self._arguments = (noise, tuple(contacts), hard_dynamics, use_motion)
+
+    # ---- many frames: the protocol FrameProblem ---------------------------------------------------------------
+
+    @property
+    def frame_count(self) -> int:
+        """Number of frames."""
+        return len(self.motion)
+
+    def __len__(self) -> int:
+        return len(self.motion)
+
+    @property
+    def noise(self) -> HumanDynamicsNoise:
+        """Variances of the model, the pseudo-measurements and the prior."""
+        return self.system.noise
+
+    @property
+    def pattern(self) -> LeastSquares:
+        """A least-squares problem with the pattern of every frame."""
+        return self.system.pattern
+
+    @property
+    def marginals(self) -> tuple[IntArray, ...]:
+        """Groups of unknowns whose joint covariance the view needs."""
+        return self.system.marginals
+
+    def whitened_frames(self, frames: slice) -> tuple[FloatArray, FloatArray]:
+        """Whitened non-zeros (n, nnz) and right-hand sides (n, rows) of some frames."""
+        values = [sensor.values[frames] for sensor in self.sensors]
+        entries, rhs = self.system.raw(self.motion.kinematics(frames), values)
+        self._whitening.apply(entries, rhs, values, frames)
+        return entries, rhs
+
+    def frame(self, index: int) -> LeastSquares:
+        """One frame with its values, covariances and constraints filled in; later calls refill the same object."""
+        if not 0 <= index < len(self):
+            raise InputError("frame", f"0 to {len(self) - 1}", str(index))
+        frames, system, problem = slice(index, index + 1), self.system, self.system.pattern
+        k = self.motion.kinematics(frames)
+        values = [sensor.values[frames] for sensor in self.sensors]
+        entries, rhs = system.raw(k, values)
+        problem.jacobian.matrix.data[:], problem.jacobian.rhs[:] = entries[0], rhs[0]
+        for i, rows in enumerate(system.sensors):
+            problem.set_covariance(rows.name, self._whitening.covariance(i, index, values[i][0]))
+        if system.hard_dynamics:
+            hard, right = system.hard(k)
+            problem.equalities.matrix.data[:], problem.equalities.rhs[:] = hard[0], right[0]
+        for constraint in self.constraints:
+            blocks, limit = constraint.rows(self.motion.tree, k, index)
+            problem.set_constraint(constraint.name, blocks, limit)
+        return problem
+
+    def view_frames(self, result: Any) -> HumanDynamicsEstimate:
+        """The typed view of all frames (a :class:`factorgrasp.solvers.frames.FrameResult`)."""
+        return read_frames(self, result)
+
+    # ---- one frame: the protocol LinearProblem ----------------------------------------------------------------
+
+    def at(self, frames: int | slice | BoolArray | IntArray) -> HumanDynamics:
+        """The same problem at some of the frames."""
+        index = np.atleast_1d(np.arange(len(self))[frames])
+        noise, contacts, hard, use = self._arguments
+        sensors = tuple(sensor.frames(index) for sensor in self.sensors)
+        constraints = tuple(constraint.frames(index) for constraint in self.constraints)
+        return HumanDynamics(self.motion.select(index), sensors, noise, contacts, constraints, hard, use)
+
+    def least_squares(self) -> LeastSquares:
+        """The problem of a single frame, for :func:`factorgrasp.solve` with any solver."""
+        if len(self) != 1:
+            raise InputError("human dynamics", "one frame here", f"{len(self)}", "Use solve_frames(problem), or solve(problem.at(k))")
+        return self.frame(0)
+
+    def view(self, estimate: Estimate) -> HumanDynamicsEstimate:
+        """The typed view of a single frame."""
+        return self.view_frames(_as_result(self, estimate))
+
+
+def _as_result(problem: HumanDynamics, estimate: Estimate) -> Any:
+    """A single estimate in the form of a result of frames."""
+    from types import SimpleNamespace
+
+    system = problem.pattern
+    x = np.concatenate([estimate.values[v.name] for v in system.variables])[None]
+    covariance = estimate.covariance_source is not None
+    blocks: list[FloatArray] = []
+    variances = np.empty((1, 0))
+    if covariance:
+        eye = np.eye(system.size)
+        P = estimate.readout_covariance(eye)
+        variances = np.diag(P)[None].copy()
+        blocks = [P[np.ix_(group, group)][None] for group in problem.marginals]
+    return SimpleNamespace(
+        x=x, variances=variances, marginals=tuple(blocks), status=(estimate.status,),
+        messages={0: estimate.message} if estimate.message else {}, solver=estimate.solver,
+        time=estimate.timing.get("total", float("nan")), careful=0, multipliers=(dict(estimate.multipliers),),
+    )  # fmt: skip
