@@ -1,7 +1,8 @@
 """Root-mean-square errors over the Cramer-Rao bound where the model holds: a robot without noise.
 
-Beside the bound stands the efficient estimator of :mod:`grasp_bound`. It meets the bound and sees the same noise, so that the ratio of both
-errors is free of most of the Monte-Carlo scatter: with its root-mean-square error in place of the bound, a few dozen seeds tell 1 % apart.
+Beside the bound stands the efficient estimator of :mod:`grasp_bound`. Its covariance is the bound, exactly, and it sees the same noise. So
+the ratio of both root-mean-square errors estimates RMSE over bound without most of the Monte-Carlo scatter (a control variate): 200 seeds tell
+1 % apart, where the plain ratio scatters by 3 %. The former is what the target is held against.
 """
 
 from __future__ import annotations
@@ -69,23 +70,11 @@ def measure(seeds: Sequence[int], workers: int) -> tuple[Table, list[Metric]]:
         if name == "time offset":
             continue
         count = f"{len(seeds)} seeds"
+        words = f"{count}, sampling sd {paired_sd:.3f}; the bound by the errors of the efficient estimator on the same noise"
+        plain_words = f"{count}, sampling sd {ratio_sd:.3f}"
         metrics += [
-            Metric(
-                f"RMSE / Cramer-Rao bound, {name}",
-                ratio,
-                "",
-                "lower",
-                TARGET,
-                f"{count}, sampling sd {ratio_sd:.3f}",
-            ),
-            Metric(
-                f"RMSE / efficient estimator on the same noise, {name}",
-                paired,
-                "",
-                "lower",
-                TARGET,
-                f"{count}, sampling sd {paired_sd:.3f}",
-            ),
+            Metric(f"RMSE / Cramer-Rao bound, {name}", paired, "", "lower", TARGET, words),
+            Metric(f"RMSE / Cramer-Rao bound, {name}, plain", ratio, note=plain_words),
         ]
     if len(seeds) < FEWEST_SEEDS:
         metrics = [m.without_target("too few seeds to judge") for m in metrics]

@@ -157,9 +157,7 @@ def main(arguments: list[str] | None = None) -> None:
         print(
             f"  claimed sd of the lever arm: {', '.join(f'{1e3 * value:.3g}' for value in sd)} mm; {part.status[-1]}"
         )
-        print(
-            f"  error along the printed axis: {1e3 * along:.3g} mm; start of the paper: {1e3 * (np.array((0.5, 0, 0)) - TRANSLATION) @ AXIS:.3g} mm"
-        )
+        print(f"  error along the printed axis: {1e3 * along:.3g} mm")
 
 
 if __name__ == "__main__":

@@ -11,10 +11,15 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from factorgrasp.problems.grasp_estimate import GraspPoseEstimate
     from factorgrasp.problems.grasp_from_poses import GraspPoseFromPoses
+    from factorgrasp.problems.grasp_from_poses_estimate import GraspFromPosesEstimate
+    from factorgrasp.problems.grasp_from_poses_settings import GraspFromPosesNoise, GraspFromPosesSettings
     from factorgrasp.problems.grasp_pose import GraspPose
     from factorgrasp.problems.grasp_settings import GraspNoise, GraspPrior, GraspSettings
 
 _WHERE = {
+    "GraspFromPosesEstimate": "grasp_from_poses_estimate",
+    "GraspFromPosesNoise": "grasp_from_poses_settings",
+    "GraspFromPosesSettings": "grasp_from_poses_settings",
     "GraspNoise": "grasp_settings",
     "GraspPose": "grasp_pose",
     "GraspPoseEstimate": "grasp_estimate",
@@ -24,6 +29,9 @@ _WHERE = {
 }
 
 __all__ = [
+    "GraspFromPosesEstimate",
+    "GraspFromPosesNoise",
+    "GraspFromPosesSettings",
     "GraspNoise",
     "GraspPose",
     "GraspPoseEstimate",

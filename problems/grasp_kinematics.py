@@ -26,7 +26,6 @@ RobotStream = PoseStream | MotionStream | ImuStream | JointStream
 DERIVATIVE_ORDER = 4
 # Steps of a stream that is called uniform differ by less than this part of the median step.
 _UNIFORM = 0.02
-_NOISE_BLOCK, _NOISE_BLOCKS = 512, 16
 
 
 @dataclass(frozen=True)
@@ -160,20 +159,6 @@ def differentiator(bandwidth: float, step: float, samples: int, field: str) -> t
     return window, signals.savgol_bandwidth(window, DERIVATIVE_ORDER, step, deriv=2)
 
 
-def white_noise_sd(x: FloatArray, order: int = 6) -> float:
-    """Standard deviation of white noise on a smooth signal (n, c), from its differences of a high order (robust, NaN aware)."""
-    from math import comb
-
-    # A few thousand differences from all over the recording tell as much as all of them.
-    starts = np.linspace(0, max(x.shape[0] - _NOISE_BLOCK, 0), _NOISE_BLOCKS).astype(int)
-    blocks = [np.diff(x[start : start + _NOISE_BLOCK], n=order, axis=0) for start in np.unique(starts)]
-    differences = np.concatenate(blocks)
-    differences = differences[np.isfinite(differences).all(axis=1)]
-    if differences.shape[0] < 10:
-        return 0.0
-    return float(np.median(np.abs(differences)) / 0.6745 / np.sqrt(comb(2 * order, order)))
-
-
 def _from_poses(
     robot: PoseStream, noise: GraspNoise, gravity: FloatArray, bandwidth: float, limit: float
 ) -> RobotKinematics:
@@ -190,9 +175,9 @@ def _from_poses(
         position[missing], quaternion[missing] = np.nan, np.nan
     position_sd, rotation_sd = noise.robot_position_sd, noise.robot_rotation_sd
     if position_sd is None:
-        position_sd = white_noise_sd(position)
+        position_sd = signals.white_noise_sd(position)
     if rotation_sd is None:
-        rotation_sd = 2.0 * white_noise_sd(quaternion)
+        rotation_sd = signals.rotation_noise_sd(quaternion)
     return _from_uniform_poses(
         grid, position, quaternion, gravity, bandwidth, float(position_sd), float(rotation_sd), robot.name
     )
@@ -271,7 +256,7 @@ def _from_motion(robot: MotionStream, noise: GraspNoise, limit: float) -> RobotK
     root = np.sqrt((grid[-1] - grid[0]) / (grid.size - 1))
     densities = _white(
         *(
-            white_noise_sd(signal) * root if density is None else density
+            signals.white_noise_sd(signal) * root if density is None else density
             for density, signal in zip(declared, (rate, acceleration, force), strict=True)
         )
     )

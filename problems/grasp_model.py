@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -75,7 +76,7 @@ _PHI_JACOBIAN = _translation_jacobian()
 
 def phi_matrix(translation: FloatArray) -> FloatArray:
     """(3, 12) matrix that gives ``phi r`` from [f_r, al_r, vech(w_r w_r')] for ``r = translation`` (3,)."""
-    return np.asarray(np.tensordot(translation, _PHI_JACOBIAN, 1))
+    return np.asarray((translation @ _PHI_JACOBIAN.reshape(3, 36)).reshape(3, 12))
 
 
 @dataclass(frozen=True)
@@ -93,17 +94,17 @@ class GraspModel:
     variables: tuple[Variable, ...]
     fixed: Mapping[str, FloatArray]
 
-    @property
+    @cached_property
     def size(self) -> int:
         """Dimension of the tangent space."""
         return sum(variable.size for variable in self.variables)
 
-    @property
+    @cached_property
     def columns(self) -> dict[str, slice]:
         """Columns of every variable."""
         return slices(self.variables)
 
-    @property
+    @cached_property
     def accelerometer_width(self) -> int:
         """Entries of z_a."""
         return TILTED_WIDTH if any(v.name == "base_tilt" for v in self.variables) else ACCELEROMETER_WIDTH
@@ -137,9 +138,10 @@ class GraspModel:
     def sensor_matrices(self, state: State) -> tuple[FloatArray, FloatArray]:
         """``M_g`` and ``M_a`` (3, 3): hand sensor axes to end-effector axes."""
         R = state["rotation"]
-        C_g = np.tensordot(self.value(state, "gyro_calibration"), _SYMMETRIC, 1)
-        C_a = np.tensordot(self.value(state, "accelerometer_calibration"), _FULL, 1)
-        return R + R @ C_g, R + R @ C_a
+        c_g, c_a = self.value(state, "gyro_calibration"), self.value(state, "accelerometer_calibration")
+        M_g = R + R @ np.tensordot(c_g, _SYMMETRIC, 1) if c_g.any() else R
+        M_a = R + R @ c_a.reshape(3, 3) if c_a.any() else R
+        return M_g, M_a
 
     def jacobians(self, state: State) -> tuple[FloatArray, FloatArray]:
         """Derivatives of L_g (n, 3, 10) and L_a (n, 3, width) by the tangent components."""

@@ -167,7 +167,7 @@ def _stretch_scale(
     Stretches are also merged by two and three, since slow drifts show only over long stretches. Axes of a
     rotation or a lever arm are a matter of convention, so the worst of the three counts for all.
     """
-    from scipy.stats import chi2
+    from scipy.special import chdtri
 
     scale = np.ones(model.size)
     count = moments.dof.shape[0]
@@ -192,7 +192,7 @@ def _stretch_scale(
         merged = merged - merged.mean(axis=0)
         dof = merged.shape[0] - 1
         ratio = np.sum((merged @ bread) ** 2, axis=0) * (dof + 1) / dof / modelled
-        scale = np.maximum(scale, np.where(ratio > chi2.ppf(_PROBABILITY, dof) / dof, ratio, 1.0))
+        scale = np.maximum(scale, np.where(ratio > chdtri(dof, 1.0 - _PROBABILITY) / dof, ratio, 1.0))
     for name in ("rotation", "translation"):
         scale[model.columns[name]] = scale[model.columns[name]].max()
     return scale
@@ -247,11 +247,11 @@ def _disagreement(arms: FloatArray, covariances: FloatArray) -> tuple[FloatArray
     error times its share of the information; the squares of these moves add up (the cluster-robust variance
     with bands for clusters).
     """
-    from scipy.stats import chi2
+    from scipy.special import chdtri
 
     axes = np.linalg.eigh(arms.T @ arms)[1]
     count = arms.shape[0]
-    limit = float(chi2.ppf(1.0 - (1.0 - _PROBABILITY) / 3.0, count - 1))
+    limit = float(chdtri(count - 1, (1.0 - _PROBABILITY) / 3.0))
     excess, largest = np.zeros((3, 3)), 0.0
     for axis in axes.T:
         x = arms @ axis

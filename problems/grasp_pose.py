@@ -123,7 +123,7 @@ class GraspPose:
     ) -> None:
         self.noise, self.settings = noise or GraspNoise(), settings or GraspSettings()
         self.prior = prior or GraspPrior()
-        self.gravity = _checked_gravity(gravity)
+        self.gravity = checked_gravity(gravity)
         if not isinstance(hand, ImuStream):
             raise InputError(
                 "hand",
@@ -508,7 +508,7 @@ def _projected(Z: FloatArray) -> FloatArray:
     return np.asarray(root @ root.T)
 
 
-def _checked_gravity(gravity: Sequence[float] | FloatArray) -> FloatArray:
+def checked_gravity(gravity: Sequence[float] | FloatArray) -> FloatArray:
     out = np.asarray(gravity, dtype=float)
     if out.shape != (3,) or not np.all(np.isfinite(out)):
         raise InputError("gravity", "3 finite numbers in m/s^2", str(gravity))

@@ -341,7 +341,8 @@ def _rotation_invariant_correlation(x: FloatArray, y: FloatArray) -> FloatArray:
     """Correlation (lags,) of x (n, 3) with every stretch of y (m, 3), m >= n, best rotation and means removed."""
     from scipy import fft
 
-    good_x, good_y = np.isfinite(x).all(axis=1), np.isfinite(y).all(axis=1)
+    good_x: BoolArray = np.asarray(np.isfinite(x).all(axis=1))
+    good_y: BoolArray = np.asarray(np.isfinite(y).all(axis=1))
     if good_x.sum() < 8 or good_y.sum() < 8:
         return np.full(y.shape[0] - x.shape[0] + 1, np.nan)
     a = np.where(good_x[:, None], x - x[good_x].mean(axis=0), 0.0)

@@ -36,6 +36,8 @@ class SegmentMoments:
         The same with squared window weights and with the noise in: the covariance of the scores.
     numbers : float
         Independent numbers in the residuals of both sensors.
+    taken_out : float
+        Sum of squares that the expected noise makes up at the start: what was taken out of the moments there.
     """
 
     t: float
@@ -44,6 +46,7 @@ class SegmentMoments:
     gyro_score: FloatArray
     accelerometer_score: FloatArray
     numbers: float
+    taken_out: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -54,10 +57,10 @@ class Quadratic:
     gradient: FloatArray
     matrix: FloatArray
 
-    def rows(self) -> tuple[FloatArray, FloatArray]:
-        """``A`` (n + 1, n) and ``b`` (n + 1,) with ``A'A = |matrix|``, ``A'b = -gradient`` and ``1/2 |b|^2 = value``.
+    def rows(self, offset: float) -> tuple[FloatArray, FloatArray]:
+        """``A`` (n + 1, n) and ``b`` (n + 1,) with ``A'A = |matrix|``, ``A'b = -gradient`` and ``1/2 |b|^2 = value + offset``.
 
-        The last row of A is zero; its entry of b holds what no step can change.
+        The last row of A is zero; its entry of b holds what no step can change. `offset` is a constant that keeps this part positive.
         """
         size = self.gradient.size
         diagonal = np.abs(np.diag(self.matrix))
@@ -69,7 +72,7 @@ class Quadratic:
         A, b = np.zeros((size + 1, size)), np.zeros(size + 1)
         A[:size] = root[:, None] * vectors.T * scale
         b[:size] = -(vectors.T @ (self.gradient / scale)) / np.where(used, root, np.inf)
-        b[size] = np.sqrt(max(2.0 * self.value - float(b @ b), 0.0))
+        b[size] = np.sqrt(max(2.0 * (self.value + offset) - float(b @ b), 0.0))
         return A, b
 
 
@@ -94,12 +97,21 @@ class SegmentFactor:
         model: GraspModel,
         moments: SegmentMoments,
         slip_rate_variance: float,
-        keys: tuple[int, ...],
-        read: Callable[[Any], State],
+        keys: tuple[int, ...] = (),
+        read: Callable[[Any], State] = dict,
     ) -> None:
         self.model, self.moments, self.keys = model, moments, keys
         self._slip_rate_variance = slip_rate_variance
         self._read = read
+
+    @property
+    def offset(self) -> float:
+        """Constant that rows add to the value, which less the expected noise may be negative."""
+        return 0.5 * (self.moments.numbers + self.moments.taken_out)
+
+    def rows(self, state: State) -> tuple[FloatArray, FloatArray]:
+        """Rows of a least-squares term at a state; see :meth:`Quadratic.rows`."""
+        return self.quadratic(state).rows(self.offset)
 
     def quadratic(self, state: State) -> Quadratic:
         """Second-order model of the cost at a state with the names of the grasp model."""
@@ -187,14 +199,15 @@ class SegmentFactor:
         for i, part in enumerate(parts):
             arguments += [form.matrix[part, other] for other in parts[i:]]
             arguments.append(-form.gradient[part])
-        return gtsam.HessianFactor(*arguments, 2.0 * form.value)
+        make: Any = gtsam.HessianFactor
+        return make(*arguments, 2.0 * form.value)
 
     def custom(self) -> Any:
         """``gtsam.CustomFactor`` that hands out the rows at any values: exact for any of gtsam's optimisers, a callback a linearisation."""
         import gtsam
 
         def error(_this: Any, values: Any, jacobians: Any) -> FloatArray:
-            A, b = self.quadratic(self._read(values)).rows()
+            A, b = self.rows(self._read(values))
             if jacobians is not None:
                 jacobians[0], jacobians[1] = A[:, 0:3], A[:, 3:6]
                 if len(self.keys) == 3:

@@ -157,7 +157,8 @@ def wahba_start(cross: FloatArray, prior: GraspPrior) -> FloatArray:
 
 def insignificant(variables: tuple[Variable, ...], state: State, covariance: FloatArray) -> frozenset[str]:
     """Groups of sensor errors that the data do not show to differ from zero (chi-square of the whole group, 99.9 %)."""
-    from scipy.stats import chi2
+    # scipy.stats would take a second to import, in the middle of a live stream.
+    from scipy.special import chdtri
 
     where = slices(variables)
     out = set()
@@ -165,7 +166,7 @@ def insignificant(variables: tuple[Variable, ...], state: State, covariance: Flo
         if variable.name in SENSOR_ERRORS:
             part = covariance[where[variable.name], where[variable.name]]
             value = state[variable.name]
-            if value @ np.linalg.solve(part, value) < chi2.ppf(0.999, variable.size):
+            if value @ np.linalg.solve(part, value) < chdtri(variable.size, 0.001):
                 out.add(variable.name)
     return frozenset(out)
 

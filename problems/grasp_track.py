@@ -185,9 +185,11 @@ def _counted(term: TermSummary, numbers: FloatArray) -> TermSummary:
     """The summary of the moments in independent numbers of the recording, not in compressed rows."""
     if term.name != "moments":
         return term
-    rms = float(np.sqrt(term.chi2 / numbers.sum()))
-    worst = term.worst / float(np.sqrt(np.median(numbers)))
-    return replace(term, rows=round(float(numbers.sum())), rms=rms, worst=worst)
+    # Rows hold the number of independent numbers as a constant; see SegmentFactor.offset.
+    total = float(numbers.sum())
+    chi2 = max(term.chi2 - total, 0.0)
+    worst = np.sqrt(max(term.worst**2 / float(np.median(numbers)) - 1.0, 0.0))
+    return replace(term, rows=round(total), chi2=chi2, rms=float(np.sqrt(chi2 / total)), worst=float(worst))
 
 
 def _triple(values: FloatArray, digits: int) -> str:

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import comb
 
 import numpy as np
 
-from factorgrasp import lie
+from factorgrasp import lie, signals
 from factorgrasp.errors import InputError
 from factorgrasp.problems.grasp_kinematics import gap_limit
 from factorgrasp.recordings import PoseStream
 from factorgrasp.typing import BoolArray, FloatArray, IntArray
 
 # White noise is read off differences of this order: a hand's motion hardly reaches them.
-_DIFFERENCES = 6
 # Nobody's hand makes a corner in this time (s).
 _LONGEST_SMOOTHING = 0.1
 
@@ -152,15 +150,11 @@ class PoseCurve:
 
 
 def _white_noise(R: FloatArray, p: FloatArray, stretch: IntArray) -> FloatArray:
-    """White noise (rad, m) per axis, from what is too fast to be motion: sixth differences of the poses."""
-    steps = np.hstack([lie.so3_log(transposed(R[:-1]) @ R[1:]), np.diff(p, axis=0)])
-    steps[stretch[1:] != stretch[:-1]] = np.nan
-    fast = np.diff(steps, n=_DIFFERENCES - 1, axis=0)
-    fast = np.abs(fast[np.isfinite(fast).all(axis=1)])
-    if len(fast) < 10:
-        return np.zeros(2)
-    gain = 0.6745 * np.sqrt(comb(2 * _DIFFERENCES, _DIFFERENCES))
-    return np.asarray(np.array([np.median(fast[:, :3]), np.median(fast[:, 3:])]) / gain)
+    """White noise (rad, m) per axis; no difference reaches across the end of a stretch."""
+    rotation, position = lie.matrix_to_quaternion_wxyz(R, continuous=True), p.copy()
+    ends = np.flatnonzero(stretch[1:] != stretch[:-1]) + 1
+    rotation, position = np.insert(rotation, ends, np.nan, axis=0), np.insert(position, ends, np.nan, axis=0)
+    return np.array([signals.rotation_noise_sd(rotation), signals.white_noise_sd(position)])
 
 
 def _half_width(R: FloatArray, p: FloatArray, step: float, sd: FloatArray) -> int:

@@ -14,7 +14,7 @@ from factorgrasp.typing import BoolArray, FloatArray, IntArray
 
 # Relative motions over this time (s) tell more than the noise of two camera poses and still less than a turn.
 _PAIR_SECONDS = 0.5
-_MOST_PAIRS = 800
+_MOST_PAIRS, _FEW_PAIRS = 800, 160
 _COARSE_STEP, _FINE_STEP = 0.02, 0.002
 # A second singular value of the relative rotations below this part of the first: they share one axis.
 _ONE_AXIS = 0.02
@@ -37,6 +37,11 @@ class _Pairs:
     turn: FloatArray
     way: FloatArray
 
+    def thinned(self, most: int) -> _Pairs:
+        """At most this many of them, evenly."""
+        every = -(-self.first.size // most)
+        return _Pairs(self.first[::every], self.last[::every], self.turn[::every], self.way[::every])
+
 
 def _pairs(curve: PoseCurve) -> _Pairs:
     last = np.searchsorted(curve.t, curve.t + _PAIR_SECONDS)
@@ -48,10 +53,10 @@ def _pairs(curve: PoseCurve) -> _Pairs:
             f"poses over more than {_PAIR_SECONDS:g} s on both sides",
             f"{np.ptp(curve.t):.3g} s",
         )
-    first = first[:: -(-first.size // _MOST_PAIRS)]
     last = last[first]
     turn = lie.so3_log(transposed(curve.rotation[first]) @ curve.rotation[last])
-    return _Pairs(curve.t[first], curve.t[last], turn, curve.position[last] - curve.position[first])
+    pairs = _Pairs(curve.t[first], curve.t[last], turn, curve.position[last] - curve.position[first])
+    return pairs.thinned(_MOST_PAIRS)
 
 
 def _other_side(
@@ -80,14 +85,15 @@ def match_clocks(coupling: PoseCoupling, guess: float, reach: float) -> ClockMat
     """
     pairs = _pairs(coupling.sampled)
 
-    def scores(offset: float) -> tuple[float, float]:
+    def scores(offset: float, pairs: _Pairs = pairs) -> tuple[float, float]:
         turn, way, inside = _other_side(coupling, pairs, offset)
         if np.count_nonzero(inside) < max(3, 0.25 * inside.size):
             return -1.0, -1.0
         return _alike(turn[inside], pairs.turn[inside]), _alike(way[inside], pairs.way[inside])
 
     coarse = guess + _COARSE_STEP * np.arange(-round(reach / _COARSE_STEP), round(reach / _COARSE_STEP) + 1)
-    table = np.array([scores(float(offset)) for offset in coarse])
+    few = pairs.thinned(_FEW_PAIRS)
+    table = np.array([scores(float(offset), few) for offset in coarse])
     kind = 0 if table[:, 0].max() >= min(0.5, table[:, 1].max()) else 1
     if table[:, kind].max() < 0.0:
         return ClockMatch(guess, 0.0)

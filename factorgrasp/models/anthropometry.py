@@ -51,7 +51,9 @@ REFERENCE_STATURE: Mapping[Sex, float] = {"female": 1.735, "male": 1.741}
 
 DE_LEVA: Mapping[Sex, Mapping[str, SegmentRow]] = {
     "female": {
-        "head": SegmentRow(0.2437, 0.0668, 0.4841, 0.271, 0.295, 0.261),  # vertex to cervicale (C7), neck included
+        "head": SegmentRow(
+            0.2437, 0.0668, 0.4841, 0.271, 0.295, 0.261
+        ),  # vertex to cervicale (C7), neck included
         "upper_trunk": SegmentRow(0.2280, 0.1545, 0.5050, 0.466, 0.314, 0.449),  # cervicale to xiphion
         "middle_trunk": SegmentRow(0.2053, 0.1465, 0.4512, 0.433, 0.354, 0.415),  # xiphion to omphalion
         "lower_trunk": SegmentRow(0.1815, 0.1247, 0.4920, 0.433, 0.402, 0.444),  # omphalion to mid-hip

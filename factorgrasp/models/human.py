@@ -1,7 +1,7 @@
 """A human body of 23 rigid segments and 22 ball joints (66 degrees of freedom) from height, mass and sex (mathematics 4.6).
 
-Segments and joints have the names of the Xsens MVN body model. In the zero configuration the body stands in a T-pose: x forward, y to the left,
-z up, all frames parallel to the world's, each at the joint to its parent, the pelvis' in the middle between the hip joints.
+Segments and joints have the names of the Xsens MVN body model. In the zero configuration the body stands in a T-pose: x forward, y to
+the left, z up, all frames parallel to the world's, each at the joint to its parent, the pelvis' in the middle between the hip joints.
 """
 
 from __future__ import annotations
@@ -90,7 +90,10 @@ class HumanBody:
             ball = self.placements[f"j{side}BallFoot"]
             depth = -tables.ANKLE_HEIGHT * self.height
             heel = ball[0] - tables.BALL_OF_FOOT * self.foot_length
-            spans = {"Foot": (heel, float(ball[0]), depth), "Toe": (0.0, float(self.ends[f"{side}Toe"][0]), depth - ball[2])}
+            spans = {
+                "Foot": (heel, float(ball[0]), depth),
+                "Toe": (0.0, float(self.ends[f"{side}Toe"][0]), depth - ball[2]),
+            }
             for name, (back, front, z) in spans.items():
                 corners = [(x, y, z) for x in (back, front) for y in (-breadth, breadth)]
                 out[f"{side}{name}"] = np.array(corners, dtype=np.float64)
@@ -215,7 +218,10 @@ def human_body(height: float, mass: float, sex: Sex = "male") -> HumanBody:
     total = sum(row.mass * (2 if name in _PAIRED else 1) for name, row in rows.items())
     upright = height * (1.0 - tables.ANKLE_HEIGHT)
     stack = upright / sum(rows[name].length for name in _STACK)
-    along = {name: rows[name].length * (stack if name in _STACK else height / tables.REFERENCE_STATURE[sex]) for name in rows}
+    along = {
+        name: rows[name].length * (stack if name in _STACK else height / tables.REFERENCE_STATURE[sex])
+        for name in rows
+    }
     kg = {name: row.mass * mass / total for name, row in rows.items()}
     segments: dict[str, Solid] = {}
     placements: dict[str, FloatArray] = {}
@@ -241,7 +247,11 @@ def load_body(urdf: str | Path, floating: bool = True) -> Any:
     if not path.is_file():
         raise InputError("urdf", "an existing URDF file", str(path))
     try:
-        return pin.buildModelFromUrdf(str(path), pin.JointModelFreeFlyer()) if floating else pin.buildModelFromUrdf(str(path))
+        return (
+            pin.buildModelFromUrdf(str(path), pin.JointModelFreeFlyer())
+            if floating
+            else pin.buildModelFromUrdf(str(path))
+        )
     except (ValueError, RuntimeError) as error:
         raise InputError("urdf", "a URDF file that pinocchio reads", f"{path}: {error}") from error
 
@@ -265,7 +275,9 @@ def configuration(model: Any, angles: Mapping[str, ArrayLike], count: int | None
     import pinocchio as pin
 
     values = {name: np.asarray(value, dtype=float) for name, value in angles.items()}
-    shape = np.broadcast_shapes(*(value.shape for value in values.values()), () if count is None else (count,))
+    shape = np.broadcast_shapes(
+        *(value.shape for value in values.values()), () if count is None else (count,)
+    )
     q = np.tile(pin.neutral(model), (*shape, 1)) if shape else np.asarray(pin.neutral(model))
     for name, value in values.items():
         if not model.existJointName(name) or model.joints[model.getJointId(name)].nq != 1:
@@ -283,7 +295,11 @@ def check_segments(segments: Mapping[str, Solid], mass: float) -> None:
         if not (np.isfinite(solid.mass) and solid.mass > 0.0):
             raise InputError(f"mass of {link}", "above 0 kg", f"{solid.mass} kg")
         moments = np.linalg.eigvalsh(solid.inertia)
-        if not np.isfinite(moments).all() or moments[0] <= 0.0 or moments[0] + moments[1] < (1.0 - 1e-9) * moments[2]:
+        if (
+            not np.isfinite(moments).all()
+            or moments[0] <= 0.0
+            or moments[0] + moments[1] < (1.0 - 1e-9) * moments[2]
+        ):
             raise InputError(
                 f"inertia of {link}",
                 "positive principal moments, each at most the sum of the other two",
@@ -325,16 +341,24 @@ def _trunk_and_head(
     rows = tables.DE_LEVA[sex]
     levels = np.cumsum([0.0, along["lower_trunk"], along["middle_trunk"], along["upper_trunk"]])
     columns = []
-    for part, bottom, top in zip(("lower_trunk", "middle_trunk", "upper_trunk"), levels, levels[1:], strict=False):
+    for part, bottom, top in zip(
+        ("lower_trunk", "middle_trunk", "upper_trunk"), levels, levels[1:], strict=False
+    ):
         row, length = rows[part], float(top - bottom)
-        sagittal, transverse, longitudinal = (length * row.sagittal) ** 2, (length * row.transverse) ** 2, (length * row.longitudinal) ** 2
+        sagittal, transverse, longitudinal = (
+            (length * row.sagittal) ** 2,
+            (length * row.transverse) ** 2,
+            (length * row.longitudinal) ** 2,
+        )
         columns.append(
             Column(
                 float(bottom), float(top), kg[part], float(top) - row.com * length,
                 0.5 * (longitudinal - sagittal + transverse), 0.5 * (longitudinal + sagittal - transverse),
             )
         )  # fmt: skip
-    girdle = np.array([0.0, tables.STERNOCLAVICULAR_OFFSET * height, tables.SUPRASTERNALE_HEIGHT[sex] * stack])
+    girdle = np.array(
+        [0.0, tables.STERNOCLAVICULAR_OFFSET * height, tables.SUPRASTERNALE_HEIGHT[sex] * stack]
+    )
     shoulder = np.array([0.0, tables.HALF_BIACROMIAL[sex] * height, tables.MID_SHOULDER_HEIGHT[sex] * stack])
     left = rod(tables.SHOULDER_MASS * mass, girdle, shoulder, tables.SHOULDER_DENSITY)
     columns[2] = _without_shoulders(columns[2], left)
@@ -350,7 +374,9 @@ def _trunk_and_head(
         pieces = [piece for column in columns if (piece := column.slice(low, high)) is not None]
         segments[link] = join(pieces).moved(np.array([0.0, 0.0, -low]))
         ends[link] = np.array([0.0, 0.0, high - low])
-    for joint, low, high in zip(("jL5S1", "jL4L3", "jL1T12", "jT9T8", "jT1C7"), heights, heights[1:], strict=False):
+    for joint, low, high in zip(
+        ("jL5S1", "jL4L3", "jL1T12", "jT9T8", "jT1C7"), heights, heights[1:], strict=False
+    ):
         placements[joint] = np.array([0.0, 0.0, high - low])
 
     t8 = np.array([0.0, 0.0, heights[4]])
@@ -364,11 +390,11 @@ def _trunk_and_head(
     head = rows["head"]
     radii = along["head"] * np.array([head.sagittal, head.transverse, head.longitudinal])
     both = gyration(kg["head"], np.array([0.0, 0.0, (1.0 - head.com) * along["head"]]), radii)
-    joint = np.array([0.0, 0.0, tables.NECK_LENGTH * height])
-    neck = rod(tables.NECK_SHARE * kg["head"], np.zeros(3), joint, tables.NECK_DENSITY)
-    segments["Neck"], placements["jC1Head"], ends["Neck"] = neck, joint, joint
-    segments["Head"] = remove(both, neck).moved(-joint)
-    ends["Head"] = np.array([0.0, 0.0, along["head"]]) - joint
+    skull = np.array([0.0, 0.0, tables.NECK_LENGTH * height])
+    neck = rod(tables.NECK_SHARE * kg["head"], np.zeros(3), skull, tables.NECK_DENSITY)
+    segments["Neck"], placements["jC1Head"], ends["Neck"] = neck, skull, skull
+    segments["Head"] = remove(both, neck).moved(-skull)
+    ends["Head"] = np.array([0.0, 0.0, along["head"]]) - skull
 
 
 def _without_shoulders(upper: Column, left: Solid) -> Column:

@@ -117,12 +117,14 @@ class Column:
             )
         if min(self.spread_x, self.spread_y) < 0.0:
             raise InputError(
-                "cross-section of a part of the trunk", "second moments above zero", f"{self.spread_x}, {self.spread_y}"
+                "cross-section of a part of the trunk",
+                "second moments above zero",
+                f"{self.spread_x}, {self.spread_y}",
             )
 
     @property
     def slope(self) -> float:
-        """Slope b of the density ``m / L (1 + b u)``, u from -1/2 at the bottom to 1/2 at the top: it puts the centre of mass in its place."""
+        """Slope b of the density ``m / L (1 + b u)``, u from -1/2 (bottom) to 1/2 (top), that puts the centre of mass in its place."""
         return 12.0 * ((self.com - self.bottom) / (self.top - self.bottom) - 0.5)
 
     def slice(self, low: float, high: float) -> Solid | None:

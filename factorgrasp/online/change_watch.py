@@ -10,7 +10,7 @@ import numpy as np
 from factorgrasp.online.coupled_rows import ACCELEROMETER, GYRO, shift_hand
 from factorgrasp.online.fitter import GraspFitter, columns_of
 from factorgrasp.online.jump_detector import GRASP, STARTS, Jump, JumpDetector
-from factorgrasp.online.moment_solver import data_normal, local, retract
+from factorgrasp.online.moment_solver import batched_normals, local, retract
 from factorgrasp.online.row_history import RowHistory
 from factorgrasp.problems.grasp_model import GraspModel
 from factorgrasp.typing import FloatArray, State
@@ -158,10 +158,8 @@ class ChangeWatch:
         short = self._fitter.short
         c = self._coefficients.last(count).reshape(count, short.bank.windowing.bins, 2, -1)
         Z_g, Z_a = short.segment_moments(c[..., GYRO], c[..., ACCELEROMETER])
-        residuals = short.residuals
-        for time, gyro, accelerometer in zip(self._coefficients.last_times(count), Z_g, Z_a, strict=True):
-            normal = data_normal(self._model, self._reference, gyro, accelerometer)
-            self._detector.add_segment(float(time), *normal, residuals)
+        normals = batched_normals(self._model, self._reference, Z_g, Z_a)
+        self._detector.add_segments(self._coefficients.last_times(count), *normals, short.residuals)
 
     def _before(self, jump: Jump) -> tuple[float, State, FloatArray]:
         assert self._reference is not None

@@ -70,6 +70,8 @@ class Setup:
         Samples of the robot's differentiation.
     finer_step : float or None
         s; see :class:`factorgrasp.online.robot_feed.RobotFeed`.
+    master_step : float
+        s, of the grid on which both sides meet.
     averaged : int
         Samples that one row of z averages.
     step : float
@@ -84,6 +86,7 @@ class Setup:
     bandwidth: float
     window: int
     finer_step: float | None
+    master_step: float
     averaged: int
     step: float
     noise: Callable[[FloatArray], RobotNoise]
@@ -120,7 +123,7 @@ def analyse(
     if kind != "motion":
         window = differentiator(kinematics_bandwidth, timings[0].step, t.size, "robot stream")[0]
     return Setup(
-        timings[0], timings[1], clock, bandwidth, window, finer, averaged, averaged * master, motion.noise
+        timings[0], timings[1], clock, bandwidth, window, finer, master, averaged, averaged * master, motion.noise
     )
 
 
@@ -140,7 +143,7 @@ def feed(setup: Setup, kind: RobotKind, gravity: FloatArray, tilted: bool) -> Ro
 
 def coupler(setup: Setup, hand: SampleBuffer, tilted: bool, keep: float) -> Coupler:
     """Both sides together."""
-    return Coupler(HandReader(hand, setup.hand.limit), setup.averaged, setup.step, tilted, keep)
+    return Coupler(HandReader(hand), setup.averaged, setup.step, tilted, keep)
 
 
 def _stream(kind: RobotKind, t: FloatArray, x: FloatArray) -> PoseStream | MotionStream | ImuStream:

@@ -41,8 +41,8 @@ def shift_hand(z: FloatArray, shift: float) -> None:
 class HandReader:
     """The hand's settled samples at other times of its clock; never across a gap."""
 
-    def __init__(self, buffer: SampleBuffer, limit: float) -> None:
-        self._buffer, self._limit = buffer, limit
+    def __init__(self, buffer: SampleBuffer) -> None:
+        self._buffer = buffer
 
     @property
     def ready(self) -> float:
@@ -65,12 +65,12 @@ class HandReader:
             if abs((last - first) - (times.size - 1)) < _UNIFORM:
                 return shifted_rows(x, 0.5 * (first + last - (times.size - 1)), times.size)
         try:
-            return signals.resample_uniform(t, x, times, max_gap=self._limit, kind="cubic")[1]
+            return signals.resample_uniform(t, x, times, max_gap=self._buffer.limit, kind="cubic")[1]
         except InputError:  # fewer than two good samples around
             return np.full((times.size, 6), np.nan)
 
     def release_before(self, time: float) -> None:
-        """Let samples go that no time from `time` on needs."""
+        """Let samples go that no time after `time` needs."""
         t, _ = self._buffer.settled()
         self._buffer.release(int(np.searchsorted(t, time)) - 4)
 
@@ -95,11 +95,17 @@ class Coupler:
         self._width = row_width(tilted)
         self._queue: deque[Piece] = deque()
         self.overflown = 0
+        self._done = -np.inf
         self._break()
 
     def push(self, pieces: list[Piece]) -> None:
         """Queue rows of the robot."""
-        self._queue.extend(pieces)
+        for piece in pieces:
+            if self._queue and not piece.starts:
+                # One piece is read and averaged faster than two.
+                last = self._queue.pop()
+                piece = Piece(np.concatenate([last.t, piece.t]), np.concatenate([last.x, piece.x]), last.starts)
+            self._queue.append(piece)
         while len(self._queue) > 1 and self._queue[-1].t[-1] - self._queue[0].t[-1] > self._keep:
             self.overflown += self._queue.popleft().t.size
             self._break()
@@ -117,8 +123,18 @@ class Coupler:
             if piece.starts:
                 self._break()
             out += self._couple(piece.t, piece.x, self._hand.at(piece.t + offset))
-            self._hand.release_before(float(piece.t[-1]) + offset)
+            self._done = float(piece.t[-1])
         return out
+
+    def available(self, offset: float) -> float:
+        """Time (s) that could be pulled now."""
+        if not self._queue:
+            return 0.0
+        return min(self._hand.ready - offset, float(self._queue[-1].t[-1])) - float(self._queue[0].t[0])
+
+    def release(self, offset: float) -> None:
+        """Let the hand's samples go that no later row needs."""
+        self._hand.release_before(self._done + offset)
 
     def _break(self) -> None:
         """What follows is a new piece."""

@@ -23,8 +23,8 @@ from factorgrasp.typing import FloatArray, IntArray, State
 GRASP_NAMES = ("rotation", "translation")
 # Half-overlapping windows after which a level is used: the short windows at once, the long ones when their slow start no longer costs much.
 _ENOUGH_SHORT, _ENOUGH_LONG = 2.0, 6.0
-# Steps below this many standard deviations need no second look.
-_TOLERANCE = 0.02
+# A warm start whose step is below this many standard deviations is there.
+_TOLERANCE = 0.5
 # Half a turn from the present rotation lie the other local optima, if any. They are tried while data are few.
 _HALF_TURNS = np.array([np.diag(signs) for signs in ((1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, 1.0))])
 # A start that ends lower by this much of the cost (a log likelihood) is better.

@@ -17,9 +17,9 @@ from factorgrasp.online.robot_feed import COLUMNS, RobotFeed, RobotKind
 from factorgrasp.online.sample_buffer import SampleBuffer
 from factorgrasp.online.tracker import GraspTracker
 from factorgrasp.problems import grasp_words
+from factorgrasp.problems.grasp_pose import checked_gravity
 from factorgrasp.problems.grasp_recording import SMALLEST_CORRELATION
 from factorgrasp.problems.grasp_settings import GraspNoise, GraspPrior, GraspSettings
-from factorgrasp.problems.grasp_system import checked_gravity
 from factorgrasp.status import Status
 from factorgrasp.typing import FloatArray
 
@@ -28,6 +28,8 @@ _RETRY = 0.5
 # s; the offset found in the first seconds is applied and they are read again until it moves by less than this.
 _SETTLED_START = 2e-4
 _MOST_PASSES = 4
+# Chunks that are a block long but for rounding.
+_ALMOST = 0.9
 # A quaternion shorter than 1 by more than this was interpolated across a change of sign: a gap. A longer one is something else.
 _QUATERNION_TOLERANCE = 1e-2
 
@@ -220,10 +222,8 @@ class OnlineGraspPose:
             return (state[name], sd[where[name]]) if name in where else (np.zeros(size), np.zeros(size))
 
         offset, offset_sd = known("time_offset", 1)
-        rotation, translation = full[:3, :3], full[3:6, 3:6]
-        resolved = (
-            np.linalg.eigvalsh(rotation)[-1] <= self.settings.rotation_resolution**2
-            and np.linalg.eigvalsh(translation)[-1] <= self.settings.translation_resolution**2
+        resolved = _resolved(full[:3, :3], self.settings.rotation_resolution) and _resolved(
+            full[3:6, 3:6], self.settings.translation_resolution
         )
         out = OnlineGraspEstimate(
             tracker.time,
@@ -264,74 +264,105 @@ class OnlineGraspPose:
         return "Too little data of this grasp yet."
 
     def _counts(self) -> tuple[StreamCounts, StreamCounts]:
-        robot, hand = self._robot, self._hand
-        cutter = None if self._feed is None else self._feed.cutter
         lost = 0 if self._coupler is None else self._coupler.overflown
-        return (
-            StreamCounts()
-            if robot is None
-            else StreamCounts(
-                robot.received,
-                robot.late,
-                robot.duplicates,
-                0 if cutter is None else cutter.incomplete,
-                0 if cutter is None else cutter.gaps,
-                robot.overflown + lost,
-            ),
-            StreamCounts(
-                hand.received,
-                hand.late,
-                hand.duplicates,
-                0 if self._coupler is None else self._coupler.hand.incomplete,
-                0 if self._coupler is None else self._coupler.hand.gaps,
-                hand.overflown,
-            ),
-        )
+        robot = StreamCounts() if self._robot is None else _counted(self._robot, lost)
+        return robot, _counted(self._hand, 0)
 
     # ---- internals ---------------------------------------------------------------------------------------
 
     def _advance(self) -> None:
+        if self._robot is None:
+            return
         if self._tracker is None:
             self._try_start()
-        elif self._robot is not None and self._feed is not None and self._coupler is not None:
-            t, x = self._robot.settled()
-            if t.size >= self._batch:
-                self._coupler.push(self._feed.push(t, x))
-                self._robot.release(t.size)
+            return
+        assert self._feed is not None and self._coupler is not None and self._setup is not None
+        t, x = self._robot.settled()
+        if t.size * self._setup.robot.step >= _ALMOST * self._block:
+            self._coupler.push(self._feed.push(t, x))
+            self._robot.release(t.size)
+        if self._coupler.available(self._offset) + self._setup.master_step >= _ALMOST * self._block:
             for piece in self._coupler.pull(self._offset):
                 self._tracker.take(piece)
-            self._follow_clock()
-
-    def _follow_clock(self) -> None:
-        assert self._tracker is not None
-        self._offset += self._tracker.clock_shift
-        self._tracker.clock_shift = 0.0
+            self._offset += self._tracker.taken_clock_shift()
+            self._coupler.release(self._offset)
 
     def _try_start(self) -> None:
         """Start when the first seconds suffice."""
-        if self._robot is None or min(self._robot.newest, self._hand.newest) == -np.inf:
-            return
-        progress = self._robot.newest
-        if progress < self._next_try:
+        assert self._robot is not None and self._kind is not None
+        if self._robot.newest < self._next_try or not self._hand.received:
             return
         robot, hand = self._robot.everything(), self._hand.everything()
         if not (enough(*robot, self._start_seconds) and enough(*hand, self._start_seconds)):
             return
-        self._next_try = progress + _RETRY
-        assert self._kind is not None
+        self._next_try = self._robot.newest + _RETRY
         setup = analyse(self._kind, robot, hand, self.noise, self.settings, self.gravity)
         self._correlation = setup.clock.correlation
         if setup.clock.correlation < SMALLEST_CORRELATION:
             return
-        self._robot.start(setup.robot.step)
-        self._hand.start(setup.hand.step)
+        self._robot.start(setup.robot.step, setup.robot.limit)
+        self._hand.start(setup.hand.step, setup.hand.limit)
         self._setup, self._offset = setup, setup.clock.offset
         for _ in range(_MOST_PASSES):
-            if abs(self._read_start(setup)) < _SETTLED_START:
+            error = self._read_start(setup)
+            if abs(error) < _SETTLED_START:
                 break
-        t, _ = self._robot.settled()
-        self._robot.release(t.size)
+            self._offset += error
+        assert self._tracker is not None and self._coupler is not None
+        self._robot.release(self._robot.settled()[0].size)
+        self._coupler.release(self._offset)
 
     def _read_start(self, setup: Setup) -> float:
-        """Read the first seconds with the present offset; returns by how much (s) it was wrong."""
-        ...
+        """Read the first seconds with the present offset; returns how wrong (s) that turned out."""
+        assert self._robot is not None and self._kind is not None
+        self._feed = feed(setup, self._kind, self.gravity, self.settings.base_tilt)
+        self._coupler = coupler(setup, self._hand, self.settings.base_tilt, self._keep)
+        self._tracker = GraspTracker(
+            setup.step, setup.bandwidth, setup.noise, self.noise, self.settings, self.prior, self._detector, self._block
+        )
+        self._coupler.push(self._feed.push(*self._robot.settled()))
+        for piece in self._coupler.pull(self._offset):
+            self._tracker.take(piece)
+        error = self._tracker.taken_clock_shift()
+        fit = self._tracker.solve()
+        if fit is not None and "time_offset" in fit.state:
+            error += float(fit.state["time_offset"][0])
+        return error
+
+
+def _resolved(covariance: FloatArray, resolution: float) -> bool:
+    """Whether the largest standard deviation in a covariance (3, 3) is within the resolution."""
+    limit = resolution**2
+    return bool(np.trace(covariance) <= limit or np.linalg.eigvalsh(covariance)[-1] <= limit)
+
+
+def _counted(buffer: SampleBuffer, lost: int) -> StreamCounts:
+    return StreamCounts(
+        buffer.received, buffer.late, buffer.duplicates, buffer.incomplete, buffer.gaps, buffer.overflown + lost
+    )
+
+
+def _stamps(t: npt.ArrayLike, name: str) -> FloatArray:
+    out = np.atleast_1d(np.asarray(t, dtype=np.float64))
+    if out.ndim != 1 or not np.isfinite(out).all():
+        raise InputError(name, "a finite time stamp or an array of them, shape (m,) [s]", f"shape {out.shape}: {out}")
+    return out
+
+
+def _rows(values: npt.ArrayLike | None, name: str, count: int, width: int) -> FloatArray:
+    if values is None:
+        raise InputError(name, f"shape ({count}, {width})", "nothing")
+    out = np.asarray(values, dtype=np.float64)
+    if out.ndim == 1 and count == 1:
+        out = out[None]
+    if out.shape != (count, width):
+        raise InputError(name, f"shape ({count}, {width}), one row a time stamp", f"shape {out.shape}")
+    return out
+
+
+def _quaternions(q: FloatArray, name: str) -> FloatArray:
+    norm = np.sqrt(np.einsum("ij,ij->i", q, q))
+    if np.any(norm > 1.0 + _QUATERNION_TOLERANCE):
+        worst = float(np.nanmax(norm))
+        raise InputError(name, "unit quaternions [w, x, y, z]", f"norm {worst:.6g}")
+    return np.asarray(q / np.where(norm < 1.0 - _QUATERNION_TOLERANCE, np.nan, norm)[:, None])

@@ -64,10 +64,16 @@ class JumpDetector:
         self._segments = RowHistory(STARTS[-1] + 1, 2 + size + size**2)
         self._snapshots = RowHistory(STARTS[-1] + 2, size + size**2)
 
-    def add_segment(self, time: float, cost: float, gradient: FloatArray, information: FloatArray, residuals: float) -> None:
-        """Cost, gradient (n,), Gauss-Newton matrix (n, n) at the reference state of a segment that ends at `time`, and its number of residuals."""
-        row = np.concatenate([[cost, residuals], gradient, information.ravel()])
-        self._segments.append(np.array([time]), row[None], False)
+    def add_segments(
+        self, times: FloatArray, costs: FloatArray, gradients: FloatArray, informations: FloatArray, residuals: float
+    ) -> None:
+        """Costs (S,), gradients (S, n), Gauss-Newton matrices (S, n, n) at the reference state of segments that end at `times` (S,).
+
+        `residuals` is the number of independent residuals of each.
+        """
+        count = times.size
+        rows = np.column_stack([costs, np.full(count, residuals), gradients, informations.reshape(count, -1)])
+        self._segments.append(times, rows, False)
 
     def add_snapshot(self, time: float, mean: FloatArray, covariance: FloatArray) -> None:
         """Estimate relative to the reference state (n,) and its covariance (n, n) from data up to `time`."""

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
+from factorgrasp import lie
 from factorgrasp.problems.grasp_model import GraspModel, quadratic_forms
 from factorgrasp.problems.grasp_system import floored_inverse, positive_part
 from factorgrasp.typing import FloatArray, State
+
+# 1/rad^2; a rotation's prior below this is none.
+_KNOWN = 1.0
 
 
 @dataclass(frozen=True)
@@ -19,6 +25,11 @@ class GaussianPrior:
     mean: State
     information: FloatArray
 
+    @cached_property
+    def knows_rotation(self) -> bool:
+        """Whether it says anything of the rotation; otherwise it only keeps the system regular."""
+        return bool(self.information[0, 0] > _KNOWN)
+
 
 class Moment(NamedTuple):
     """Weighted second moments, less their expected noise, and the squared-weight ones with it."""
@@ -27,14 +38,6 @@ class Moment(NamedTuple):
     accelerometer: FloatArray
     gyro_squared: FloatArray
     accelerometer_squared: FloatArray
-
-
-class Normal(NamedTuple):
-    """Cost, gradient (n,) and Gauss-Newton matrix (n, n) at a state."""
-
-    cost: float
-    gradient: FloatArray
-    information: FloatArray
 
 
 @dataclass(frozen=True)
@@ -55,20 +58,61 @@ class Fit:
 
 def retract(model: GraspModel, state: State, step: FloatArray) -> dict[str, FloatArray]:
     """Move a state by a tangent step (n,)."""
-    return {v.name: v.retract(state[v.name], step[where]) for v, where in zip(model.variables, model.columns.values(), strict=True)}
+    moved: dict[str, FloatArray] = {}
+    for variable, where in zip(model.variables, model.columns.values(), strict=True):
+        value, part = state[variable.name], step[where]
+        moved[variable.name] = value @ _turn(part) if variable.manifold == "rotation" else value + part
+    return moved
 
 
 def local(model: GraspModel, origin: State, state: State) -> FloatArray:
     """Tangent step (n,) from `origin` to `state`."""
-    return np.concatenate([v.local(origin[v.name], state[v.name]) for v in model.variables])
+    parts = [
+        _rotation_between(origin[v.name], state[v.name]) if v.manifold == "rotation" else state[v.name] - origin[v.name]
+        for v in model.variables
+    ]
+    return np.concatenate(parts)
 
 
-def data_normal(model: GraspModel, state: State, Z_g: FloatArray, Z_a: FloatArray) -> Normal:
-    """The data's part."""
-    L_g, L_a = model.matrices(state)
-    J_g, J_a = model.jacobians(state)
-    gyro, accelerometer = quadratic_forms(L_g, J_g, Z_g), quadratic_forms(L_a, J_a, Z_a)
-    return Normal(gyro[0] + accelerometer[0], gyro[1] + accelerometer[1], gyro[2] + accelerometer[2])
+def _turn(v: FloatArray) -> FloatArray:
+    """``exp(v)`` (3, 3); for a single one several times faster than the batched exponential."""
+    x, y, z = v.tolist()
+    angle = math.sqrt(x * x + y * y + z * z)
+    if angle < 1e-8:
+        a, b = 1.0, 0.5
+    else:
+        a, b = math.sin(angle) / angle, 2.0 * (math.sin(0.5 * angle) / angle) ** 2
+    return np.array(
+        [
+            [1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y],
+            [b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x],
+            [b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y)],
+        ]
+    )
+
+
+def _rotation_between(A: FloatArray, B: FloatArray) -> FloatArray:
+    """``log(A' B)`` (3,); for a single one several times faster than the batched logarithm."""
+    M = A.T @ B
+    v = 0.5 * np.array([M[2, 1] - M[1, 2], M[0, 2] - M[2, 0], M[1, 0] - M[0, 1]])
+    sine, cosine = math.sqrt(v @ v), 0.5 * (M[0, 0] + M[1, 1] + M[2, 2] - 1.0)
+    if cosine < -0.9:
+        return lie.so3_log(M)
+    return np.asarray(v if sine == 0.0 else v * (math.atan2(sine, cosine) / sine))
+
+
+def batched_normals(
+    model: GraspModel, state: State, Z_g: FloatArray, Z_a: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Costs (S,), gradients (S, n) and Gauss-Newton matrices (S, n, n) of moments (S, 10, 10) and (S, m, m)."""
+    cost, gradient, information = np.zeros(Z_g.shape[0]), np.zeros(1), np.zeros(1)
+    for L, J, Z in zip(model.matrices(state), model.jacobians(state), (Z_g, Z_a), strict=True):
+        n, width = J.shape[0], J.shape[2]
+        JZ = np.matmul(J.reshape(-1, width), Z).reshape(-1, n, 3 * width)
+        cost = cost + 0.5 * np.matmul(np.matmul(L, Z).reshape(-1, 3 * width), L.ravel())
+        gradient = gradient + np.matmul(JZ, L.ravel())
+        information = information + np.matmul(JZ, J.reshape(n, -1).T)
+    return cost, gradient, information
 
 
 def descend(
@@ -76,24 +120,51 @@ def descend(
 ) -> Fit:
     """Gauss-Newton from `start` until a step is below `tolerance` standard deviations.
 
-    Taking the expected noise out can leave small negative eigenvalues in the moments where nothing excites; their positive part is used.
+    Parameters
+    ----------
+    model : GraspModel
+    start : State
+    moment : Moment
+    prior : GaussianPrior
+    iterations : int
+        At most.
+    tolerance : float
+        The last step is still taken. It is off by its square times the curvature, which is tiny: half a standard deviation is a good tolerance
+        for a warm start.
     """
-    roots = positive_part(moment.gyro), positive_part(moment.accelerometer)
-    Z_g, Z_a = (root @ root.T for root in roots)
+    Z_g, Z_a = _positive(moment.gyro), _positive(moment.accelerometer)
     state = dict(start)
-    for iteration in range(iterations + 1):
-        data = data_normal(model, state, Z_g, Z_a)
-        error = local(model, prior.mean, state)
+    for _ in range(iterations):
+        L_g, L_a = model.matrices(state)
+        J_g, J_a = model.jacobians(state)
+        gyro, accelerometer = quadratic_forms(L_g, J_g, Z_g), quadratic_forms(L_a, J_a, Z_a)
+        error = _prior_error(model, prior, state)
         pull = prior.information @ error
-        H = data.information + prior.information
-        if iteration == iterations:
-            break
-        gradient = data.gradient + pull
+        gradient = gyro[1] + accelerometer[1] + pull
+        H = gyro[2] + accelerometer[2] + prior.information
         step = -np.linalg.solve(H, gradient)
         state = retract(model, state, step)
-        if -float(step @ gradient) < tolerance**2:
+        gained = -float(step @ gradient)
+        if gained < tolerance**2:
             break
-    L_g, L_a = model.matrices(state)
-    J_g, J_a = model.jacobians(state)
+    cost = gyro[0] + accelerometer[0] + 0.5 * float(error @ pull) - 0.5 * gained
     meat = quadratic_forms(L_g, J_g, moment.gyro_squared)[2] + quadratic_forms(L_a, J_a, moment.accelerometer_squared)[2]
-    return Fit(model, state, data.cost + 0.5 * float(error @ pull), H, meat + prior.information)
+    return Fit(model, state, cost, H, meat + prior.information)
+
+
+def _prior_error(model: GraspModel, prior: GaussianPrior, state: State) -> FloatArray:
+    if prior.knows_rotation:
+        return local(model, prior.mean, state)
+    parts = [np.zeros(3) if v.name == "rotation" else state[v.name] - prior.mean[v.name] for v in model.variables]
+    return np.concatenate(parts)
+
+
+def _positive(Z: FloatArray) -> FloatArray:
+    """Z (m, m), or the nearest positive semidefinite matrix: taking the expected noise out can leave small negative eigenvalues."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(Z), 1e-300))
+    try:
+        np.linalg.cholesky(scale[:, None] * Z * scale)
+    except np.linalg.LinAlgError:
+        root = positive_part(Z)
+        return np.asarray(root @ root.T)
+    return Z

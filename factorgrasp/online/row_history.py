@@ -40,4 +40,4 @@ class RowHistory:
     @property
     def kept(self) -> int:
         """Rows of the uninterrupted piece at the end that are still here."""
-        return min(self.run, self._end)
+        return min(self.run, self.rows)

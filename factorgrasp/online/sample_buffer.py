@@ -31,7 +31,9 @@ class SampleBuffer:
         self.lateness, self.keep = lateness, keep
         self.step = 0.0
         """Nominal step (s); zero while it is unknown, and nothing is settled."""
-        self.late = self.duplicates = self.overflown = self.received = 0
+        self.limit = np.inf
+        """A longer step (s) is a gap."""
+        self.received = self.late = self.duplicates = self.overflown = self.incomplete = self.gaps = 0
         self._t = np.empty(_FIRST_ROWS)
         self._x = np.empty((_FIRST_ROWS, columns))
         self._begin = self._settled = self._end = 0
@@ -75,9 +77,9 @@ class SampleBuffer:
         """Let the oldest `rows` settled rows go."""
         self._begin = min(self._begin + max(rows, 0), self._settled)
 
-    def start(self, step: float) -> None:
-        """Declare the nominal step; from now on rows get settled."""
-        self.step = step
+    def start(self, step: float, limit: float) -> None:
+        """Declare the nominal step and the longest one that is no gap (s); from now on rows get settled."""
+        self.step, self.limit = step, limit
         self._settle()
 
     def _append(self, t: FloatArray, x: FloatArray) -> None:
@@ -132,6 +134,8 @@ class SampleBuffer:
             if self._newest - t[hole] <= self.lateness:
                 settled = before + int(hole) + 1
                 break
-        self._settled = max(settled, self._settled)
-        if self._settled > self._begin:
-            self._frontier = float(self._t[self._settled - 1])
+        if settled > self._settled:
+            new = slice(self._settled, settled)
+            self.incomplete += int(np.count_nonzero(np.isnan(self._x[new]).any(axis=1)))
+            self.gaps += int(np.count_nonzero(t[1 : settled - before] - t[: settled - before - 1] > self.limit))
+            self._settled, self._frontier = settled, float(self._t[settled - 1])

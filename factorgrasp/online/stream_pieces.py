@@ -33,26 +33,21 @@ class GapCutter:
 
     def __init__(self, limit: float) -> None:
         self.limit = limit
-        self.gaps = self.incomplete = 0
         self._last = np.nan
 
     def cut(self, t: FloatArray, x: FloatArray) -> list[Piece]:
         """Pieces of the next rows x (m, c) with ascending stamps t (m,)."""
         if t.size == 0:
             return []
-        good = np.isfinite(x).all(axis=1)
-        steps = np.diff(t, prepend=self._last)
-        starts = ~(steps <= self.limit)
-        if good.all() and not starts[1:].any():
-            follows = not bool(starts[0])
-            self.gaps += int(not follows and np.isfinite(self._last))
+        first = not t[0] - self._last <= self.limit
+        whole = t.size == 1 or bool((t[1:] - t[:-1]).max() <= self.limit)
+        if whole and np.isfinite(x).all():
             self._last = t[-1]
-            return [Piece(t, x, not follows)]
-        broken = ~good
-        self.incomplete += int(np.count_nonzero(broken))
-        self.gaps += int(np.count_nonzero(starts & np.isfinite(steps)))
+            return [Piece(t, x, first)]
+        good = np.isfinite(x).all(axis=1)
+        starts = np.concatenate([[first], ~(t[1:] - t[:-1] <= self.limit)])
         # A new piece begins after every long step and after every incomplete row.
-        starts[1:] |= broken[:-1]
+        starts[1:] |= ~good[:-1]
         group = np.cumsum(starts)
         out = []
         for k in np.unique(group[good]):

@@ -29,7 +29,7 @@ from factorgrasp.typing import FloatArray, State
 # s; the jump test looks at windows of twice this length, one every such time.
 SEGMENT = 0.1
 # Reviews of the weights: often while the estimate is young, then now and then (s of data).
-_YOUNG, _OFTEN, _SELDOM = 5.0, 0.5, 2.0
+_YOUNG, _OFTEN, _SELDOM = 5.0, 0.5, 3.0
 # Other local optima are looked for within the first seconds only.
 _SURE = 20.0
 # A remaining clock offset above this (s) is applied to the data; the model is linear in what remains.
@@ -90,8 +90,7 @@ class GraspTracker:
         self._events: deque[GraspEvent] = deque(maxlen=_MOST_EVENTS)
         self._before: tuple[State, FloatArray] | None = None
         self.event_count = 0
-        self.clock_shift = 0.0
-        """Offset (s) found since the last call of :meth:`apply_clock_shift`."""
+        self._clock_shift = 0.0
         self._begin()
 
     def _begin(self) -> None:
@@ -176,6 +175,11 @@ class GraspTracker:
             self.fitter.solve(self._force / max(self._rows, 1), self.rate_moment)
         return self.fitter.fit
 
+    def taken_clock_shift(self) -> float:
+        """By how much (s) the hand is to be read later than before the last call."""
+        shift, self._clock_shift = self._clock_shift, 0.0
+        return shift
+
     @property
     def events(self) -> tuple[GraspEvent, ...]:
         """Changes of the grasp so far, the last one with the best present knowledge of how far."""
@@ -212,7 +216,7 @@ class GraspTracker:
             shift_hand(self.history.last(self.history.kept), shift)
             if self._watch is not None:
                 self._watch.shift_clock(shift)
-            self.clock_shift += shift
+            self._clock_shift += shift
         if self._watch is not None:
             self._watch.refer()
 

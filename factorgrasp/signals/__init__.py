@@ -6,7 +6,9 @@ plain linear one with a known response, so that noise can be propagated through 
 linear relation.
 """
 
+from factorgrasp.signals.clock import common_clock, synchronise
 from factorgrasp.signals.lag import LagEstimate, estimate_lag
+from factorgrasp.signals.noise import rotation_noise_sd, white_noise_sd
 from factorgrasp.signals.resampling import resample_rotations, resample_uniform
 from factorgrasp.signals.rotations import RotationDerivatives, differentiate_rotations
 from factorgrasp.signals.savgol import (
@@ -21,12 +23,16 @@ __all__ = [
     "LagEstimate",
     "RotationDerivatives",
     "choose_savgol",
+    "common_clock",
     "differentiate_rotations",
     "estimate_lag",
     "resample_rotations",
     "resample_uniform",
+    "rotation_noise_sd",
     "savgol_bandwidth",
     "savgol_derivatives",
     "savgol_frequency_response",
     "savgol_noise_gain",
+    "synchronise",
+    "white_noise_sd",
 ]

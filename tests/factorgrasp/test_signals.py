@@ -12,10 +12,12 @@ from factorgrasp.signals import (
     estimate_lag,
     resample_rotations,
     resample_uniform,
+    rotation_noise_sd,
     savgol_bandwidth,
     savgol_derivatives,
     savgol_frequency_response,
     savgol_noise_gain,
+    white_noise_sd,
 )
 
 DT = 1e-3
@@ -566,3 +568,18 @@ def test_real_motion_capture_against_its_gyroscope(dataset):
     lost = np.isnan(data["opt_quat"]).any(axis=1)
     assert lost.any()
     assert np.isnan(out.angular_velocity[lost]).all()
+
+
+def test_noise_levels_are_read_from_what_is_too_fast_to_be_motion(rng):
+    t = 0.004 * np.arange(6000)
+    motion = np.column_stack([np.sin(3.0 * t), np.cos(2.0 * t + 1.0), 0.3 * t])
+    noisy = motion + 2e-4 * rng.standard_normal(motion.shape)
+    noisy[1000:1100] = np.nan
+    assert white_noise_sd(noisy) == pytest.approx(2e-4, rel=0.08)
+    assert white_noise_sd(motion) < 1e-9
+    for turn in (motion, 1e-3 * motion):
+        R = lie.so3_exp(turn) @ lie.so3_exp(5e-4 * rng.standard_normal(turn.shape))
+        q = lie.matrix_to_quaternion_wxyz(R, continuous=True)
+        q[2000:2003] = np.nan
+        assert rotation_noise_sd(q) == pytest.approx(5e-4, rel=0.08)
+    assert white_noise_sd(noisy[:8]) == 0.0
