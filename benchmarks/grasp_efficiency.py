@@ -1,8 +1,8 @@
 """Root-mean-square errors over the Cramer-Rao bound where the model holds: a robot without noise.
 
-Beside the bound stands the efficient estimator of :mod:`grasp_bound`. Its covariance is the bound, exactly, and it sees the same noise. So
-the ratio of both root-mean-square errors estimates RMSE over bound without most of the Monte-Carlo scatter (a control variate): 200 seeds tell
-1 % apart, where the plain ratio scatters by 3 %. The former is what the target is held against.
+Beside the bound stands the efficient estimator of :mod:`grasp_bound`. Its covariance is the bound, exactly, and it sees the same noise.
+So the ratio of both root-mean-square errors estimates RMSE over bound without most of the Monte-Carlo scatter (a control variate): 200
+seeds tell 1 % apart, where the plain ratio scatters by 3 %. The former is what the target is held against.
 """
 
 from __future__ import annotations

@@ -129,7 +129,10 @@ class IDynTreePeer:
     def estimate(self, q: np.ndarray, qd: np.ndarray, base_rate: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, float]:
         """Unknowns d in iDynTree's order and the seconds spent in iDynTree."""
         idt = self.idt
-        jq, jv = idt.VectorDynSize.FromPython(q.tolist()), idt.VectorDynSize.FromPython(qd.tolist())
+        jq, jv = idt.JointPosDoubleArray(self.model), idt.JointDOFsDoubleArray(self.model)
+        for i in range(q.size):
+            jq.setVal(i, float(q[i]))
+            jv.setVal(i, float(qd[i]))
         rate, measured = idt.Vector3.FromPython(base_rate.tolist()), idt.VectorDynSize.FromPython(y.tolist())
         started = time.perf_counter()
         self.solver.updateEstimateInformationFloatingBase(jq, jv, self.base, rate, measured)
@@ -153,7 +156,7 @@ class IDynTreePeer:
         """Where the unknowns stand, by kind ("acceleration", "external", "wrench", "joint") and name of link, joint or degree of freedom."""
         idt = self.idt
         kinds = {
-            idt.LINK_BODY_PROPER_ACCELERATION: "acceleration", idt.NET_EXT_WRENCH: "external", idt.JOINT_WRENCH: "wrench", idt.DOF_ACCELERATION: "joint",
+            idt.LINK_BODY_PROPER_ACCELERATION: "acceleration", idt.LINK_BODY_PROPER_CLASSICAL_ACCELERATION: "acceleration", idt.NET_EXT_WRENCH: "external", idt.JOINT_WRENCH: "wrench", idt.DOF_ACCELERATION: "joint",
         }  # fmt: skip
         return {
             (kinds[v.type], v.id): slice(v.range.offset, v.range.offset + v.range.size)

@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from factorgrasp import lie
 from factorgrasp.estimate import Estimate, TermSummary
-from factorgrasp.observability import Observability
 from factorgrasp.problems import grasp_words
 from factorgrasp.problems.grasp_recording import SMALLEST_CORRELATION
+from factorgrasp.problems.grasp_view import EstimateView, PoseView, grasp_covariance
 from factorgrasp.status import Status
 from factorgrasp.typing import FloatArray, JsonDict
 
@@ -78,7 +77,7 @@ class GraspDiagnostics:
 
 
 @dataclass(frozen=True)
-class GraspPoseEstimate:
+class GraspPoseEstimate(EstimateView, PoseView):
     """Where the human grasped, with an honest covariance.
 
     Attributes
@@ -144,7 +143,7 @@ class GraspPoseEstimate:
             estimate=estimate,
             rotation=np.asarray(values["rotation"]),
             translation=np.asarray(values["translation"]),
-            covariance=estimate.covariance("rotation", "translation"),
+            covariance=grasp_covariance(estimate),
             time_offset=total,
             time_offset_sd=_time_offset_sd(estimate, problem),
             gyro_bias=gyro_bias,
@@ -153,50 +152,6 @@ class GraspPoseEstimate:
             accelerometer_bias_sd=accelerometer_bias_sd,
             diagnostics=diagnostics,
         )
-
-    @property
-    def status(self) -> Status:
-        """How the solve ended."""
-        return self.estimate.status
-
-    @property
-    def solved(self) -> bool:
-        """Whether the status is `Status.SOLVED`."""
-        return self.estimate.solved
-
-    @property
-    def message(self) -> str:
-        """Why it ended so and what would help."""
-        return self.estimate.message
-
-    @property
-    def observability(self) -> Observability | None:
-        """Directions that the motion showed or did not show."""
-        return self.estimate.observability
-
-    @property
-    def rotation_wxyz(self) -> FloatArray:
-        """``R_r_h`` as unit quaternion [w, x, y, z], w >= 0."""
-        return lie.matrix_to_quaternion_wxyz(self.rotation)
-
-    @property
-    def pose(self) -> FloatArray:
-        """``T_r_h`` as a homogeneous matrix (4, 4)."""
-        out = np.eye(4)
-        out[:3, :3], out[:3, 3] = self.rotation, self.translation
-        return out
-
-    def error_to(self, rotation: FloatArray, translation: FloatArray) -> FloatArray:
-        """Tangent vector (6,) from this estimate to another grasp, in the coordinates of `covariance`: for NEES and comparisons.
-
-        Parameters
-        ----------
-        rotation : (3, 3) ndarray
-            ``R_r_h``.
-        translation : (3,) ndarray
-            ``p_r_h``, m.
-        """
-        return np.concatenate([lie.so3_log(self.rotation.T @ rotation), translation - self.translation])
 
     def summary(self) -> str:
         """A few lines for a terminal."""
@@ -210,12 +165,7 @@ class GraspPoseEstimate:
             f"  gyroscope bias             {_triple(self.gyro_bias, 5)} rad/s   sd {_triple(self.gyro_bias_sd, 5)}",
             f"  accelerometer bias         {_triple(self.accelerometer_bias, 4)} m/s^2   sd {_triple(self.accelerometer_bias_sd, 4)}",
         ]
-        if self.observability is not None:
-            for missing in self.observability.missing:
-                size = "unknown" if not np.isfinite(missing.sd) else f"sd {missing.sd:.3g} {missing.unit}"
-                lines.append(f"  not identified: {missing.words} ({size})")
-        if self.message:
-            lines.append(f"  {self.message}")
+        lines += self.closing_lines()
         return "\n".join(lines)
 
     def to_dict(self) -> JsonDict:

@@ -9,8 +9,7 @@ import numpy as np
 
 from factorgrasp import lie
 from factorgrasp.estimate import Estimate
-from factorgrasp.observability import Observability
-from factorgrasp.status import Status
+from factorgrasp.problems.grasp_view import EstimateView, PoseView, grasp_covariance
 from factorgrasp.typing import FloatArray, JsonDict, State
 
 
@@ -61,7 +60,7 @@ class GraspFromPosesDiagnostics:
 
 
 @dataclass(frozen=True)
-class GraspFromPosesEstimate:
+class GraspFromPosesEstimate(EstimateView, PoseView):
     """Where the second sensor sits on the end-effector, with an honest covariance.
 
     Attributes
@@ -100,12 +99,11 @@ class GraspFromPosesEstimate:
         """Typed view of a solver's answer."""
         estimated = any(variable.name == "time_offset" for variable in estimate.variables)
         has_covariance = estimate.covariance_source is not None
-        unknown = np.full((6, 6), np.nan)
         return cls(
             estimate=estimate,
             rotation=np.asarray(state["rotation"]),
             translation=np.asarray(state["translation"]),
-            covariance=estimate.covariance("rotation", "translation") if has_covariance else unknown,
+            covariance=grasp_covariance(estimate),
             time_offset=float(state["time_offset"][0]),
             time_offset_sd=(float(estimate.sd("time_offset")[0]) if has_covariance else np.nan)
             if estimated
@@ -116,36 +114,9 @@ class GraspFromPosesEstimate:
         )
 
     @property
-    def status(self) -> Status:
-        """How the solve ended."""
-        return self.estimate.status
-
-    @property
-    def message(self) -> str:
-        """Why it ended so and what would help."""
-        return self.estimate.message
-
-    @property
-    def observability(self) -> Observability | None:
-        """Directions that the motion showed or did not show."""
-        return self.estimate.observability
-
-    @property
-    def rotation_wxyz(self) -> FloatArray:
-        """``R_r_h`` as unit quaternion [w, x, y, z], w >= 0."""
-        return lie.matrix_to_quaternion_wxyz(self.rotation)
-
-    @property
     def world_rotation_wxyz(self) -> FloatArray:
         """``R_w_t`` as unit quaternion [w, x, y, z], w >= 0."""
         return lie.matrix_to_quaternion_wxyz(self.world_rotation)
-
-    @property
-    def pose(self) -> FloatArray:
-        """``T_r_h`` as a homogeneous matrix (4, 4)."""
-        out = np.eye(4)
-        out[:3, :3], out[:3, 3] = self.rotation, self.translation
-        return out
 
     def summary(self) -> str:
         """A few lines for a terminal."""
@@ -160,12 +131,7 @@ class GraspFromPosesEstimate:
             f"  residual rms               {np.degrees(d.rotation_rms):.3f} deg   {1e3 * d.position_rms:.2f} mm   "
             f"({d.samples_used} samples of {d.sampled!r}, {d.samples_dropped} left out)",
         ]
-        if self.observability is not None:
-            for missing in self.observability.missing:
-                size = "unknown" if not np.isfinite(missing.sd) else f"sd {missing.sd:.3g} {missing.unit}"
-                lines.append(f"  not identified: {missing.words} ({size})")
-        if self.message:
-            lines.append(f"  {self.message}")
+        lines += self.closing_lines()
         return "\n".join(lines)
 
     def to_dict(self) -> JsonDict:

@@ -58,22 +58,41 @@ class Quadratic:
     matrix: FloatArray
 
     def rows(self, offset: float) -> tuple[FloatArray, FloatArray]:
-        """``A`` (n + 1, n) and ``b`` (n + 1,) with ``A'A = |matrix|``, ``A'b = -gradient`` and ``1/2 |b|^2 = value + offset``.
+        """``A`` (n + 1, n) and ``b`` (n + 1,): ``A'A = |matrix|``, ``A'b = -gradient``, ``|b|^2 = 2 (value + offset)``.
 
-        The last row of A is zero; its entry of b holds what no step can change. `offset` is a constant that keeps this part positive.
+        The last row of A is zero; its entry of b holds what no step can change. Where an indefinite matrix leaves
+        hardly any curvature to a gradient, the promised decrease would exceed the value: there the curvature is
+        raised until it does not.
         """
         size = self.gradient.size
         diagonal = np.abs(np.diag(self.matrix))
         scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
         values, vectors = np.linalg.eigh(self.matrix / np.outer(scale, scale))
         curvature = np.abs(values)
-        used = curvature > _ROUNDING * curvature.max(initial=1e-300)
-        root = np.sqrt(np.where(used, curvature, 0.0))
+        pull = vectors.T @ (self.gradient / scale)
+        rounding = _ROUNDING * curvature.max(initial=1e-300)
+        promised = np.where(curvature > rounding, pull**2 / np.maximum(curvature, rounding), 0.0)
+        total = max(2.0 * (self.value + offset), 1e-12)
+        if promised.sum() > total:
+            promised = np.minimum(promised, _cap(promised, total))
+        some = promised > 0.0
+        curvature[some] = pull[some] ** 2 / promised[some]
+        root = np.sqrt(curvature)
         A, b = np.zeros((size + 1, size)), np.zeros(size + 1)
         A[:size] = root[:, None] * vectors.T * scale
-        b[:size] = -(vectors.T @ (self.gradient / scale)) / np.where(used, root, np.inf)
-        b[size] = np.sqrt(max(2.0 * (self.value + offset) - float(b @ b), 0.0))
+        b[:size] = -np.sign(pull) * np.sqrt(promised)
+        b[size] = np.sqrt(max(total - float(promised.sum()), 0.0))
         return A, b
+
+
+def _cap(parts: FloatArray, total: float) -> float:
+    """The largest value that every part may have so that they add up to `total` at most."""
+    left, count = total, parts.size
+    for part in np.sort(parts):
+        if part > left / count:
+            break
+        left, count = left - part, count - 1
+    return float(left / max(count, 1))
 
 
 class SegmentFactor:

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
 from factorgrasp.online.coupled_rows import ACCELEROMETER, GYRO, shift_hand
 from factorgrasp.online.fitter import GraspFitter, columns_of
-from factorgrasp.online.jump_detector import GRASP, STARTS, Jump, JumpDetector
-from factorgrasp.online.moment_solver import batched_normals, local, retract
+from factorgrasp.online.jump_detector import GRASP, STARTS, Jump, JumpDetector, Segments, explain
+from factorgrasp.online.moment_solver import Moment, batched_normals, local, retract
 from factorgrasp.online.row_history import RowHistory
-from factorgrasp.problems.grasp_model import GraspModel
+from factorgrasp.problems.grasp_model import GYRO_WIDTH, GraspModel
 from factorgrasp.typing import FloatArray, State
 
 # A drift is told from a jump by this much evidence, and lasts at least so many segments.
@@ -80,6 +80,8 @@ class ChangeWatch:
     def __init__(self, fitter: GraspFitter, segment: int, columns: int, settings: DetectorSettings) -> None:
         self._fitter, self._segment, self._settings = fitter, segment, settings
         self._coefficients = RowHistory(STARTS[-1] + 1, fitter.short.bank.windowing.bins * 2 * columns)
+        width = fitter.long.bank.width
+        self._moments = RowHistory(STARTS[-1] + 2, 2 * (GYRO_WIDTH**2 + width**2))
         self._reference: State | None = None
         self._model: GraspModel = fitter.model
         self._detector = JumpDetector(fitter.model.size)
@@ -100,6 +102,9 @@ class ChangeWatch:
             self.refer()
         assert self._reference is not None
         self._detector.add_snapshot(time, local(self._model, self._reference, fit.state), self._fitter.covariance())
+        level = self._fitter.level
+        assert level is not None
+        self._moments.append(np.array([time]), level.moment().to_row()[None], False)
 
     def refer(self) -> None:
         """Linearise at the present estimate, with its model and its weights."""
@@ -115,6 +120,7 @@ class ChangeWatch:
             self._detector.move(shift)
             if np.linalg.norm(shift[:GRASP]) > _FAR:
                 self._detector.forget()
+                self._moments.run = 0
         self._reference = fit.state
         self._detector.forget_segments()
         self._give_segments(self._coefficients.kept)
@@ -124,42 +130,85 @@ class ChangeWatch:
         count = self._coefficients.kept
         short = self._fitter.short.bank
         shift_hand(self._coefficients.last(count).reshape(count, short.windowing.bins, 2, -1), shift)
+        self._moment_shift(shift)
         if self._reference is not None and "time_offset" in self._reference:
             self._reference = {**self._reference, "time_offset": self._reference["time_offset"] - shift}
+
+    def _moment_shift(self, shift: float) -> None:
+        """As for the coefficients: moments Z of z become T Z T'."""
+        rows = self._moments.last(self._moments.kept)
+        width = self._fitter.long.bank.width
+        T = np.eye(GYRO_WIDTH + width)
+        shift_hand(T.T, shift)
+        first = 0
+        for part, size in ((GYRO, GYRO_WIDTH), (ACCELEROMETER, width)) * 2:
+            block = rows[:, first : first + size**2]
+            change = T[part, part]
+            block[...] = (change @ block.reshape(-1, size, size) @ change.T).reshape(block.shape)
+            first += size**2
 
     def restart(self, segments: int) -> None:
         """Another grasp, of which the newest `segments` are."""
         self._coefficients.run = max(min(self._coefficients.kept, segments), 0)
         self._detector.forget()
+        self._moments.run = 0
         self._reference = None
 
     def find(self, rows: RowHistory) -> Change | None:
         """A change of the grasp in the newest segments."""
         jumps = self._detector.jumps()
-        best = max(jumps, key=lambda jump: jump.log_bayes_factor, default=None)
-        if best is None or best.log_bayes_factor < self._settings.log_bayes_factor:
+        if max((jump.log_bayes_factor for jump in jumps), default=0.0) < self._settings.log_bayes_factor:
             return None
-        angle, distance = np.linalg.norm(best.step[:3]), np.linalg.norm(best.step[3:])
-        if angle < self._settings.smallest_angle and distance < self._settings.smallest_distance:
+        best = self._confirmed(max(jumps, key=lambda jump: jump.evidence))
+        if best is None:
             return None
-        drift = max(self._detector.ramps(), key=lambda jump: jump.log_bayes_factor)
-        if drift.segments >= _SHORTEST_SLIP and drift.log_bayes_factor > best.log_bayes_factor + _SLIP_EVIDENCE:
+        _, state, covariance = self._before(best)
+        drift = max(self._detector.ramps(), key=lambda jump: jump.evidence)
+        if drift.segments >= _SHORTEST_SLIP and drift.evidence > best.evidence + _SLIP_EVIDENCE:
             time, state, covariance = self._before(drift)
             kept = max(best.segments // 2, 1) * self._segment
             return Change("slip", time, kept, state, covariance, drift)
-        _, state, covariance = self._before(best)
         kept = self._since(rows, best, state)
         return Change("regrasp", float(rows.last_times(kept + 1)[0]), kept, state, covariance, best)
+
+    def _confirmed(self, jump: Jump) -> Jump | None:
+        """The jump, if it is large and convinces even where errors of the hand's sensors could explain the residuals instead."""
+        angle, distance = np.linalg.norm(jump.step[:3]), np.linalg.norm(jump.step[3:])
+        if angle < self._settings.smallest_angle and distance < self._settings.smallest_distance:
+            return None
+        _, state, _ = self._before(jump)
+        known = Moment.from_row(self._moments.last(jump.segments)[0], self._fitter.long.bank.width)
+        fit = self._fitter.with_sensor_errors(state, known)
+        normals = batched_normals(fit.model, fit.state, *self._segment_moments(jump.segments))
+        cost, gradient, information = (part.sum(axis=0) for part in normals)
+        data = Segments(
+            [jump.segments],
+            np.array([cost]),
+            np.array([jump.segments * self._fitter.short.residuals]),
+            np.zeros((1, fit.model.size)),
+            fit.covariance()[None],
+            gradient[None],
+            information[None],
+            gradient[None, :GRASP],
+            information[None, :, :GRASP],
+            information[None, :GRASP, :GRASP],
+        )
+        surer = explain(data, 0.0, 0.0)[0]
+        if surer.log_bayes_factor < self._settings.log_bayes_factor:
+            return None
+        return replace(surer, evidence=jump.evidence)
+
+    def _segment_moments(self, count: int) -> tuple[FloatArray, FloatArray]:
+        short = self._fitter.short
+        c = self._coefficients.last(count).reshape(count, short.bank.windowing.bins, 2, -1)
+        return short.segment_moments(c[..., GYRO], c[..., ACCELEROMETER])
 
     def _give_segments(self, count: int) -> None:
         assert self._reference is not None
         if count == 0:
             return
-        short = self._fitter.short
-        c = self._coefficients.last(count).reshape(count, short.bank.windowing.bins, 2, -1)
-        Z_g, Z_a = short.segment_moments(c[..., GYRO], c[..., ACCELEROMETER])
-        normals = batched_normals(self._model, self._reference, Z_g, Z_a)
-        self._detector.add_segments(self._coefficients.last_times(count), *normals, short.residuals)
+        normals = batched_normals(self._model, self._reference, *self._segment_moments(count))
+        self._detector.add_segments(self._coefficients.last_times(count), *normals, self._fitter.short.residuals)
 
     def _before(self, jump: Jump) -> tuple[float, State, FloatArray]:
         assert self._reference is not None

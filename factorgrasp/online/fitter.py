@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from factorgrasp.online.level import Level
-from factorgrasp.online.moment_solver import Fit, GaussianPrior, descend
+from factorgrasp.online.moment_solver import Fit, GaussianPrior, Moment, descend
 from factorgrasp.problems.grasp_model import GraspModel
 from factorgrasp.problems.grasp_model_check import ModelCheck, check_model
 from factorgrasp.problems.grasp_settings import GraspNoise, GraspPrior, GraspSettings
@@ -95,6 +95,13 @@ class GraspFitter:
             self._add_sensor_errors(level)
         self._check = self._checked(level) if self._settings.check_model and level is self.long else None
 
+    def with_sensor_errors(self, start: State, moment: Moment) -> Fit:
+        """Fit of moments with every error of the hand's sensors that the settings allow as unknown."""
+        absent = frozenset(SENSOR_ERRORS) if self._settings.sensor_errors == "never" else frozenset()
+        wide = GraspModel(*grasp_variables(self._noise, self._settings, absent))
+        prior = self._widened_prior(wide)
+        return descend(wide, {**prior.mean, **start}, moment, prior, 4, _TOLERANCE)
+
     def shift_clock(self, shift: float) -> None:
         """The hand is read later by `shift` (s) from now on, and in all moments."""
         for level in (self.short, self.long):
@@ -148,13 +155,12 @@ class GraspFitter:
     def _add_sensor_errors(self, level: Level) -> None:
         """Errors of the hand's sensors that the data show become unknowns, for good."""
         assert self.fit is not None
-        wide = GraspModel(*grasp_variables(self._noise, self._settings))
-        if wide.size == self.model.size:
+        present = {variable.name for variable in self.model.variables}
+        if present.issuperset(SENSOR_ERRORS):
             return
         moment = level.moment()
-        prior = self._widened_prior(wide)
-        fit = descend(wide, {**prior.mean, **self.fit.state}, moment, prior, 4, _TOLERANCE)
-        absent = insignificant(wide.variables, fit.state, fit.covariance()) - {v.name for v in self.model.variables}
+        fit = self.with_sensor_errors(self.fit.state, moment)
+        absent = insignificant(fit.model.variables, fit.state, fit.covariance()) - present
         model = GraspModel(*grasp_variables(self._noise, self._settings, frozenset(absent)))
         if model.size == self.model.size:
             return

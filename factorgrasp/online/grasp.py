@@ -28,6 +28,8 @@ _RETRY = 0.5
 # s; the offset found in the first seconds is applied and they are read again until it moves by less than this.
 _SETTLED_START = 2e-4
 _MOST_PASSES = 4
+# s; the offset must be known this well from the first seconds, or more of them are awaited.
+_STARTING_OFFSET_SD = 3e-3
 # Chunks that are a block long but for rounding.
 _ALMOST = 0.9
 # A quaternion shorter than 1 by more than this was interpolated across a change of sign: a gap. A longer one is something else.
@@ -304,16 +306,19 @@ class OnlineGraspPose:
         self._hand.start(setup.hand.step, setup.hand.limit)
         self._setup, self._offset = setup, setup.clock.offset
         for _ in range(_MOST_PASSES):
-            error = self._read_start(setup)
-            if abs(error) < _SETTLED_START:
+            error, sd = self._read_start(setup)
+            if abs(error) < max(_SETTLED_START, 0.1 * sd):
                 break
             self._offset += error
+        if sd > _STARTING_OFFSET_SD:
+            self._tracker = None
+            return
         assert self._tracker is not None and self._coupler is not None
         self._robot.release(self._robot.settled()[0].size)
         self._coupler.release(self._offset)
 
-    def _read_start(self, setup: Setup) -> float:
-        """Read the first seconds with the present offset; returns how wrong (s) that turned out."""
+    def _read_start(self, setup: Setup) -> tuple[float, float]:
+        """Read the first seconds with the present offset; returns how wrong that turned out, and its standard deviation (s)."""
         assert self._robot is not None and self._kind is not None
         self._feed = feed(setup, self._kind, self.gravity, self.settings.base_tilt)
         self._coupler = coupler(setup, self._hand, self.settings.base_tilt, self._keep)
@@ -323,11 +328,14 @@ class OnlineGraspPose:
         self._coupler.push(self._feed.push(*self._robot.settled()))
         for piece in self._coupler.pull(self._offset):
             self._tracker.take(piece)
-        error = self._tracker.taken_clock_shift()
         fit = self._tracker.solve()
-        if fit is not None and "time_offset" in fit.state:
-            error += float(fit.state["time_offset"][0])
-        return error
+        error = self._tracker.taken_clock_shift()
+        if not self.settings.time_offset:
+            return 0.0, 0.0
+        if fit is None:
+            return 0.0, np.inf
+        where = fit.model.columns["time_offset"].start
+        return error + float(fit.state["time_offset"][0]), float(np.sqrt(self._tracker.fitter.covariance()[where, where]))
 
 
 def _resolved(covariance: FloatArray, resolution: float) -> bool:

@@ -14,6 +14,7 @@ known: the residual power of the very segments under test decides, through the S
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -39,6 +40,9 @@ class Jump:
     segments : int
         How many segments back it began.
     log_bayes_factor : float
+        Against no change, with the noise level of the segments since the start: it must convince, also where the noise has just become louder.
+    evidence : float
+        The same with one noise level for all segments held, so that starts and kinds of change can be compared.
     step : (6,) ndarray
         Posterior mean [rotation; translation] of the change, right perturbation of R.
     covariance : (6, 6) ndarray
@@ -46,6 +50,7 @@ class Jump:
 
     segments: int
     log_bayes_factor: float
+    evidence: float
     step: FloatArray
     covariance: FloatArray
 
@@ -122,10 +127,9 @@ class JumpDetector:
         rows = self._segments.last(starts[-1])[::-1]
         sums = np.cumsum(np.add.reduceat(rows, [0, *starts[:-1]], axis=0), axis=0)
         cost, count, g, H = sums[:, 0], sums[:, 1], sums[:, 2 : 2 + n], sums[:, 2 + n :].reshape(-1, n, n)
-        snapshots = self._snapshots.last(starts[-1])[::-1][np.array(starts) - 1]
-        mean, P = snapshots[:, :n], snapshots[:, n:].reshape(-1, n, n)
-        cross, own = H[:, :, :GRASP], H[:, :GRASP, :GRASP]
-        return _explain(starts, cost, count, mean, P, g, H, g[:, :GRASP], cross, own)
+        mean, P = self._known(starts)
+        data = Segments(starts, cost, count, mean, P, g, H, g[:, :GRASP], H[:, :, :GRASP], H[:, :GRASP, :GRASP])
+        return explain(data, *self._whole())
 
     def ramps(self) -> list[Jump]:
         """The best steady drift since every start; `step` is how far it has come."""
@@ -133,53 +137,80 @@ class JumpDetector:
         if not starts:
             return []
         rows = self._segments.last(starts[-1])[::-1]
-        cost, count, g, H = rows[:, 0], rows[:, 1], rows[:, 2 : 2 + n], rows[:, 2 + n :].reshape(-1, n, n)
         parts: list[list[FloatArray]] = []
         for k in starts:
             u = 1.0 - (np.arange(k) + 0.5) / k
-            H_k = H[:k]
+            total = rows[:k].sum(axis=0)
+            g, H = rows[:k, 2 : 2 + n], rows[:k, 2 + n :].reshape(-1, n, n)
             parts.append(
                 [
-                    cost[:k].sum(),
-                    count[:k].sum(),
-                    g[:k].sum(axis=0),
-                    H_k.sum(axis=0),
-                    u @ g[:k, :GRASP],
-                    np.tensordot(u, H_k[:, :, :GRASP], 1),
-                    np.tensordot(u**2, H_k[:, :GRASP, :GRASP], 1),
+                    total[0],
+                    total[1],
+                    total[2 : 2 + n],
+                    total[2 + n :].reshape(n, n),
+                    u @ g[:, :GRASP],
+                    np.tensordot(u, H[:, :, :GRASP], 1),
+                    np.tensordot(u**2, H[:, :GRASP, :GRASP], 1),
                 ]
             )
-        c, m, g_s, H_s, g_d, cross, own = (np.array(part) for part in zip(*parts, strict=True))
-        snapshots = self._snapshots.last(starts[-1])[::-1][np.array(starts) - 1]
-        mean, P = snapshots[:, :n], snapshots[:, n:].reshape(-1, n, n)
-        return _explain(starts, c, m, mean, P, g_s, H_s, g_d, cross, own)
+        cost, count, g_all, H_all, g_d, cross, own = (np.array(part) for part in zip(*parts, strict=True))
+        data = Segments(starts, cost, count, *self._known(starts), g_all, H_all, g_d, cross, own)
+        return explain(data, *self._whole())
+
+    def _known(self, starts: list[int]) -> tuple[FloatArray, FloatArray]:
+        rows = self._snapshots.last(starts[-1])[::-1][np.array(starts) - 1]
+        return rows[:, : self.size], rows[:, self.size :].reshape(-1, self.size, self.size)
+
+    def _whole(self) -> tuple[float, float]:
+        """Cost and number of residuals of all segments."""
+        rows = self._segments.last(self._segments.kept)
+        return float(rows[:, 0].sum()), float(rows[:, 1].sum())
 
 
-def _explain(
-    starts: list[int],
-    cost: FloatArray,
-    count: FloatArray,
-    mean: FloatArray,
-    P: FloatArray,
-    g: FloatArray,
-    H: FloatArray,
-    g_d: FloatArray,
-    cross: FloatArray,
-    own: FloatArray,
-) -> list[Jump]:
-    """Evidence for a change d that enters with gradient `g_d` (S, 6), information `own` (S, 6, 6) and `cross` (S, n, 6) to all unknowns."""
+class Segments(NamedTuple):
+    """Sums over the segments since each of S starts, and what was known before them.
+
+    Attributes
+    ----------
+    starts : list of int
+    cost, count : (S,) ndarray
+        Cost at the reference state, and number of residuals.
+    mean, covariance : (S, n) and (S, n, n) ndarray
+        Estimate before, relative to the reference state.
+    gradient, information : (S, n) and (S, n, n) ndarray
+        Of the unknowns before the change.
+    change_gradient, cross, change_information : (S, 6), (S, n, 6) and (S, 6, 6) ndarray
+        Of the change.
+    """
+
+    starts: list[int]
+    cost: FloatArray
+    count: FloatArray
+    mean: FloatArray
+    covariance: FloatArray
+    gradient: FloatArray
+    information: FloatArray
+    change_gradient: FloatArray
+    cross: FloatArray
+    change_information: FloatArray
+
+
+def explain(data: Segments, whole_cost: float, whole_count: float) -> list[Jump]:
+    """Evidence for a change since each start; `whole_cost` and `whole_count` are those of all segments held."""
+    mean, P, g, H = data.mean, data.covariance, data.gradient, data.information
     n = g.shape[1]
     Hm = np.matmul(H, mean[:, :, None])[:, :, 0]
     u = g + Hm
     B = np.matmul(H, P)
     B[:, np.arange(n), np.arange(n)] += 1.0
     # (P^-1 + H)^-1 = P (I + H P)^-1
-    solved = np.matmul(P, np.linalg.solve(B, np.concatenate([u[:, :, None], cross], axis=2)))
-    rss = 2.0 * cost + np.sum((2.0 * g + Hm) * mean, axis=1) - np.sum(u * solved[:, :, 0], axis=1)
-    turned = cross.transpose(0, 2, 1)
+    solved = np.matmul(P, np.linalg.solve(B, np.concatenate([u[:, :, None], data.cross], axis=2)))
+    rss = 2.0 * data.cost + np.sum((2.0 * g + Hm) * mean, axis=1) - np.sum(u * solved[:, :, 0], axis=1)
+    rss = np.maximum(rss, 0.0)
+    turned = data.cross.transpose(0, 2, 1)
     pulled = np.matmul(turned, np.stack([mean, solved[:, :, 0]], axis=2))
-    q = -(g_d + pulled[:, :, 0] - pulled[:, :, 1])
-    W = own - np.matmul(turned, solved[:, :, 1:])
+    q = -(data.change_gradient + pulled[:, :, 0] - pulled[:, :, 1])
+    W = data.change_information - np.matmul(turned, solved[:, :, 1:])
     values, vectors = np.linalg.eigh(_UNIT[:, None] * (0.5 * (W + W.transpose(0, 2, 1))) * _UNIT)
     values = np.maximum(values, 0.0)
     y = np.matmul((_UNIT * q)[:, None, :], vectors)[:, 0, :]
@@ -187,15 +218,23 @@ def _explain(
     gain = square / (1.0 + square * values)
     drop = np.sum(gain * y**2, axis=2)
     occam = 0.5 * np.sum(np.log1p(square * values), axis=2)
-    level = _PRIOR_RESIDUALS + count
-    before = _PRIOR_RESIDUALS + np.maximum(rss, 0.0)
-    after = np.maximum(before - drop, 1e-3 * before)
-    factor = 0.5 * level * np.log(before / after) - occam
-    best = np.argmax(factor, axis=0)
+    older = np.maximum(2.0 * (whole_cost - data.cost), 0.0)
+    factor = _student(_PRIOR_RESIDUALS + rss, drop, _PRIOR_RESIDUALS + data.count) - occam
+    evidence = _student(_PRIOR_RESIDUALS + older + rss, drop, _PRIOR_RESIDUALS + whole_count) - occam
+    best = np.argmax(evidence, axis=0)
     out = []
-    for s, k in enumerate(starts):
-        shrink = gain[best[s], s]
+    for s, k in enumerate(data.starts):
+        b = best[s]
         axes = _UNIT[:, None] * vectors[s]
-        noise = max(1.0, float(after[best[s], s] / level[s]))
-        out.append(Jump(k, float(factor[best[s], s]), axes @ (shrink * y[s]), noise * (axes * shrink) @ axes.T))
+        left = (_PRIOR_RESIDUALS + rss[s] - drop[b, s]) / (_PRIOR_RESIDUALS + data.count[s])
+        covariance = max(1.0, float(left)) * (axes * gain[b, s]) @ axes.T
+        out.append(
+            Jump(k, float(factor[b, s]), float(evidence[b, s]), axes @ (gain[b, s] * y[s]), covariance)
+        )
     return out
+
+
+def _student(before: FloatArray, drop: FloatArray, count: FloatArray | float) -> FloatArray:
+    """Log likelihood ratio of `count` residuals of unknown common variance whose sum of squares `before` a change lowers by `drop`."""
+    after = np.maximum(before - drop, 1e-3 * before)
+    return np.asarray(0.5 * count * np.log(before / after))

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from factorgrasp import lie
-from factorgrasp.problems.grasp_model import GraspModel, quadratic_forms
+from factorgrasp.problems.grasp_model import GYRO_WIDTH, GraspModel, quadratic_forms
 from factorgrasp.problems.grasp_system import floored_inverse, positive_part
 from factorgrasp.typing import FloatArray, State
 
@@ -38,6 +38,17 @@ class Moment(NamedTuple):
     accelerometer: FloatArray
     gyro_squared: FloatArray
     accelerometer_squared: FloatArray
+
+    def to_row(self) -> FloatArray:
+        """All entries in one row."""
+        return np.concatenate([part.ravel() for part in self])
+
+    @classmethod
+    def from_row(cls, row: FloatArray, width: int) -> Moment:
+        """Back from :meth:`to_row`, with `width` entries of z_a."""
+        sizes = (GYRO_WIDTH, width, GYRO_WIDTH, width)
+        edges = np.cumsum([size**2 for size in sizes])[:-1]
+        return cls(*(part.reshape(size, size) for part, size in zip(np.split(row, edges), sizes, strict=True)))
 
 
 @dataclass(frozen=True)

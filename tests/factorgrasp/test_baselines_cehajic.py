@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import chi
 
 from factorgrasp.baselines.cehajic2015 import (
     CehajicInputs,
@@ -22,7 +23,13 @@ from factorgrasp.simulation.cehajic2015 import (
     gravity_compensated,
     paper_inputs,
 )
-from factorgrasp.simulation.cehajic2015_figures import excitation_gramian, final_errors, reproduce_fig4
+from factorgrasp.simulation.cehajic2015_figures import (
+    error_curve,
+    excitation_gramian,
+    final_errors,
+    norm_band,
+    reproduce_fig4,
+)
 from factorgrasp.simulation.grasp import HandImu, RobotSensing
 
 NOISE_FREE = {"robot": RobotSensing(), "hand": HandImu()}
@@ -228,6 +235,29 @@ def test_errors_over_seeds_are_those_of_the_neglected_biases():
     assert np.all(predicted[:, 1] > 5e-3)
     np.testing.assert_allclose(errors.angle, predicted[:, 0], rtol=0.05)
     np.testing.assert_allclose(errors.translation, predicted[:, 1], rtol=0.05)
+
+
+def test_band_of_a_norm_is_that_of_the_chi_distribution():
+    band = norm_band(np.array([4.0 * np.eye(3), np.diag([0.0, 0.0, 9.0])]))
+    np.testing.assert_allclose(band[0], 2.0 * chi(3).ppf([0.025, 0.975]), rtol=0.03)
+    # Sampling error of the lower quantile of |N(0, 1)| from 20 000 draws: sqrt(0.025 * 0.975 / 20000) / 0.8 = 0.0014.
+    np.testing.assert_allclose(band[1], 3.0 * chi(1).ppf([0.025, 0.975]), rtol=0.02, atol=3.0 * 3.0 * 0.0014)
+
+
+def test_error_curve_states_where_errors_should_lie():
+    recording = cehajic2015(duration=1.0)
+    truth, t = recording.truth, np.array((0.2, 0.8))
+    covariance = np.array([np.diag([1e-6] * 3 + [1e-4] * 3), np.diag([4e-6] * 3 + [9e-4] * 3)])
+    history = (t, np.tile(truth.rotation_wxyz, (2, 1)), np.tile(truth.translation, (2, 1)), covariance)
+    curve = error_curve(recording, history)
+    # Half the angle, as a quaternion has it; three equal axes.
+    np.testing.assert_allclose(
+        curve.quaternion_band[:, 1], 0.5 * np.array((1e-3, 2e-3)) * chi(3).ppf(0.975), rtol=0.02
+    )
+    np.testing.assert_allclose(
+        curve.translation_band[:, 1], np.array((0.01, 0.03)) * chi(3).ppf(0.975), rtol=0.02
+    )
+    assert error_curve(recording, history[:3]).translation_band is None
 
 
 def test_figure_4_with_another_estimator(tmp_path):
