@@ -111,13 +111,18 @@ def draw_observability(
         along = np.sqrt(np.einsum("i,kij,j->k", AXIS, arm, AXIS))
         worst_across = np.sqrt(np.linalg.eigvalsh(across @ arm @ across)[:, 2])
         error = np.abs((part.translation - TRANSLATION) @ AXIS)
-        known.plot(part.t, along, color=colour, label="claimed sd along the axis")
-        known.plot(part.t, error, "o", color=colour, markersize=2.5, label="true error along it")
-        known.plot(part.t, worst_across, "--", color=colour, label="claimed sd across it")
+        known.plot(part.t, along, color=colour)
+        known.plot(part.t, error, "o", color=colour, markersize=2.5)
+        known.plot(part.t, worst_across, "--", color=colour)
+    for style, label in (
+        ("-", "claimed sd along the axis"),
+        ("o", "true error along it"),
+        ("--", "claimed sd across it"),
+    ):
+        known.plot([], [], style, color=plots.PALETTE["muted"], markersize=2.5, label=label)
     known.set_title("lever arm, by direction from the printed axis")
     known.set(xlabel="length of the recording [s]", ylabel="m", yscale="log", ylim=(1e-5, 1e3))
-    handles, labels = known.get_legend_handles_labels()
-    known.legend(handles[:3], labels[:3], loc="upper right", labelcolor=plots.PALETTE["ink"])
+    known.legend(loc="upper right")
     made.savefig(path, dpi=120)
 
 

@@ -234,7 +234,6 @@ def _takes(capabilities: Capabilities) -> str:
 
 def _solve(file: Path, solver: str | None, out: Path) -> Any:
     """Solve one file, print the answer and write it into a folder."""
-    from factorgrasp import solve
     from factorgrasp.problem_file import load_problem
     from factorgrasp.results import write_all
 
@@ -244,7 +243,7 @@ def _solve(file: Path, solver: str | None, out: Path) -> Any:
         with _working(f"reading {file}"):
             stated = load_problem(file)
         with _working("solving"):
-            estimate = solve(stated.problem, solver=solver or stated.solver)
+            estimate = stated.solve(solver)
     remarks = list(dict.fromkeys(str(warning.message) for warning in caught))
     for remark in remarks:
         _err.print(f"warning: {remark}")

@@ -43,7 +43,9 @@ def tables_of(table: Mapping[str, Any], key: str) -> Sequence[Mapping[str, Any]]
     return tables
 
 
-def read_wrenches(table: Mapping[str, Any], body: BodyMotion, base_dir: Path, default: Six) -> list[ExternalWrench]:
+def read_wrenches(
+    table: Mapping[str, Any], body: BodyMotion, base_dir: Path, default: Six
+) -> list[ExternalWrench]:
     """One sensor a link and frame of measurement, at the good frames of the motion.
 
     Plates on one link add up: their wrenches and their covariances.
@@ -54,7 +56,9 @@ def read_wrenches(table: Mapping[str, Any], body: BodyMotion, base_dir: Path, de
         where = f"[[forces]] {number}"
         covariance = np.array(get(one, "covariance", Six, where, default))
         if (covariance <= 0.0).any():
-            raise InputError(place(where, "covariance"), "six variances above zero, N^2 and (Nm)^2", f"{covariance}")
+            raise InputError(
+                place(where, "covariance"), "six variances above zero, N^2 and (Nm)^2", f"{covariance}"
+            )
         if get(one, "frame", Literal["world", "sensor"], where, "world") == "sensor":
             out.append(_in_hand(one, where, body, base_dir, covariance))
             continue
@@ -85,7 +89,9 @@ def _world_forces(one: Mapping[str, Any], where: str, base_dir: Path) -> Iterabl
     return (read_force_table(path, get(one, "link", str, where)),)
 
 
-def _on_link(link: str, parts: Sequence[tuple[ForceRecording, FloatArray, float | None]], body: BodyMotion) -> ExternalWrench:
+def _on_link(
+    link: str, parts: Sequence[tuple[ForceRecording, FloatArray, float | None]], body: BodyMotion
+) -> ExternalWrench:
     total = np.zeros((body.clock.size, 6))
     variance = np.zeros(6)
     for force, covariance, limit in parts:
@@ -122,7 +128,12 @@ def read_sensors(table: Mapping[str, Any], body: BodyMotion, base_dir: Path) -> 
         where = f"[[sensors]] {number}"
         kind = get(one, "type", str, where)
         if kind not in _SENSORS:
-            raise InputError(place(where, "type"), "one of " + ", ".join(_SENSORS), repr(kind), close_matches(kind, _SENSORS))
+            raise InputError(
+                place(where, "type"),
+                "one of " + ", ".join(_SENSORS),
+                repr(kind),
+                close_matches(kind, _SENSORS),
+            )
         path = base_dir / get(one, "file", str, where)
         variance = get(one, "covariance", float, where)
         if kind == "accelerometer":
@@ -131,24 +142,36 @@ def read_sensors(table: Mapping[str, Any], body: BodyMotion, base_dir: Path) -> 
             _check_link(link, body, where)
             values = _read_columns(path, ("ax", "ay", "az"), body)
             R, p = mounting(one, where)
-            out.append(Accelerometer(values, variance, f"accelerometer on {link}", link=link, R_l_s=R, p_l_s=p))
+            out.append(
+                Accelerometer(values, variance, f"accelerometer on {link}", link=link, R_l_s=R, p_l_s=p)
+            )
         else:
             check_keys(one, ("type", "file", "joint", "covariance"), where)
             joint = get(one, "joint", str, where)
             known = [j.name for j in body.motion.joints]
             if joint not in known:
-                raise InputError(place(where, "joint"), "a joint of the model", repr(joint), close_matches(joint, known))
+                raise InputError(
+                    place(where, "joint"), "a joint of the model", repr(joint), close_matches(joint, known)
+                )
             dofs = body.motion.joints[known.index(joint)].dofs
             if not dofs:
-                raise InputError(place(where, "joint"), "a joint with known axes", f"{joint}, of which only the centre is known")
-            out.append(JointTorque(_read_columns(path, dofs, body), variance, f"torque of {joint}", joint=joint))
+                raise InputError(
+                    place(where, "joint"),
+                    "a joint with known axes",
+                    f"{joint}, of which only the centre is known",
+                )
+            out.append(
+                JointTorque(_read_columns(path, dofs, body), variance, f"torque of {joint}", joint=joint)
+            )
     return out
 
 
 def mounting(one: Mapping[str, Any], where: str) -> tuple[FloatArray, FloatArray]:
     """``R_l_s`` and ``p_l_s`` of a sensor from ``rotation_wxyz`` and ``position``."""
     position = np.array(get(one, "position", Vector, where, (0.0, 0.0, 0.0)))
-    quaternion = np.array(convert(one.get("rotation_wxyz", [1, 0, 0, 0]), Quaternion, place(where, "rotation_wxyz")))
+    quaternion = np.array(
+        convert(one.get("rotation_wxyz", [1, 0, 0, 0]), Quaternion, place(where, "rotation_wxyz"))
+    )
     norm = float(np.linalg.norm(quaternion))
     if abs(norm - 1.0) > 1e-2:
         raise InputError(place(where, "rotation_wxyz"), "a unit quaternion [w, x, y, z]", f"norm {norm:.6g}")
@@ -163,4 +186,6 @@ def _read_columns(path: Path, names: Sequence[str], body: BodyMotion) -> FloatAr
 
 def _check_link(link: str, body: BodyMotion, where: str) -> None:
     if link not in body.motion.links:
-        raise InputError(f"{where}: link", "a link of the model", repr(link), close_matches(link, body.motion.links))
+        raise InputError(
+            f"{where}: link", "a link of the model", repr(link), close_matches(link, body.motion.links)
+        )

@@ -13,27 +13,19 @@ from factorgrasp import lie
 from factorgrasp.errors import InputError
 from factorgrasp.models.anthropometry import Sex
 from factorgrasp.models.human import human_body, load_body
+from factorgrasp.models.joint_motion import differentiate_configurations
 from factorgrasp.problems.link_motion import GRAVITY, LinkMotion
 from factorgrasp.problems.link_motion_files import load_links
 from factorgrasp.problems.link_motion_pinocchio import PinocchioTree
 from factorgrasp.recordings.opensim import read_coordinates
 from factorgrasp.recordings.tables import column_names, read_table
-from factorgrasp.signals import (
-    choose_savgol,
-    differentiate_rotations,
-    resample_rotations,
-    resample_uniform,
-    savgol_derivatives,
-    savgol_noise_gain,
-)
+from factorgrasp.signals import resample_rotations, resample_uniform
 from factorgrasp.toml_tables import check_keys, close_matches, get, place, sub_table
 from factorgrasp.typing import BoolArray, FloatArray
 
 Vector = tuple[float, float, float]
 
 _POSITION, _QUATERNION = ("px", "py", "pz"), ("qw", "qx", "qy", "qz")
-# Of the polynomial that differentiates: even, so that the second derivative gains from it.
-_ORDER = 4
 # Ground of link archives (OpenSim): y up.
 _GRAVITY_Y_UP: Vector = (0.0, -9.80665, 0.0)
 
@@ -88,9 +80,13 @@ def read_body_motion(table: Mapping[str, Any], base_dir: Path) -> BodyMotion:
         base = "floating"
         sex: Sex = get(model, "sex", Sex, "[model]")
         try:
-            body = human_body(get(model, "height", float, "[model]"), get(model, "mass", float, "[model]"), sex)
+            body = human_body(
+                get(model, "height", float, "[model]"), get(model, "mass", float, "[model]"), sex
+            )
         except InputError as error:
-            raise InputError(place("[model]", error.field), error.expected, error.found, error.hint) from error
+            raise InputError(
+                place("[model]", error.field), error.expected, error.found, error.hint
+            ) from error
         pin_model = body.model()
     gravity = get(model, "gravity", Vector, "[model]", GRAVITY)
     return _from_joints(pin_model, base == "floating", gravity, motion, base_dir)
@@ -110,14 +106,26 @@ def _from_links(model: Mapping[str, Any], motion: Mapping[str, Any], base_dir: P
         raise InputError("[motion] every", "a whole number above 0", str(every))
     read = read.select(np.flatnonzero(keep)[::every])
     finite = np.ones(len(read), dtype=bool)
-    for name in ("R", "p", "velocity", "angular_velocity", "acceleration", "angular_acceleration", "joint_centre"):
+    for name in (
+        "R",
+        "p",
+        "velocity",
+        "angular_velocity",
+        "acceleration",
+        "angular_acceleration",
+        "joint_centre",
+    ):
         finite &= np.isfinite(getattr(read, name)).all(axis=tuple(range(1, getattr(read, name).ndim)))
     return _known(read.t, finite, read)
 
 
-def _known(clock: FloatArray, good: BoolArray, motion: LinkMotion, variance: float | None = None) -> BodyMotion:
+def _known(
+    clock: FloatArray, good: BoolArray, motion: LinkMotion, variance: float | None = None
+) -> BodyMotion:
     if not good.any():
-        raise InputError("[motion]", "at least one frame in which all of the motion is known", "gaps everywhere")
+        raise InputError(
+            "[motion]", "at least one frame in which all of the motion is known", "gaps everywhere"
+        )
     return BodyMotion(clock, good, motion.select(good) if len(motion) == good.size else motion, variance)
 
 
@@ -126,7 +134,9 @@ def _span(t: FloatArray, motion: Mapping[str, Any]) -> BoolArray:
     end = get(motion, "end", float, "[motion]", np.inf)
     keep: BoolArray = np.asarray((t >= start) & (t <= end))
     if not keep.any():
-        raise InputError("[motion] start, end", f"times within {t[0]:.6g} to {t[-1]:.6g} s", f"{start:g} to {end:g} s")
+        raise InputError(
+            "[motion] start, end", f"times within {t[0]:.6g} to {t[-1]:.6g} s", f"{start:g} to {end:g} s"
+        )
     return keep
 
 
@@ -147,7 +157,9 @@ def _from_joints(
     known = [*joints, *base]
     for key in renamed:
         if key not in known:
-            raise InputError("[motion.columns] " + key, "a joint of the model", "none", close_matches(key, known))
+            raise InputError(
+                "[motion.columns] " + key, "a joint of the model", "none", close_matches(key, known)
+            )
     others = get(motion, "others", Literal["required", "zero"], where, "required")
     path = base_dir / get(motion, "file", str, where)
     t, columns = _columns(path, motion)
@@ -156,8 +168,12 @@ def _from_joints(
     needed = [name for name in missing if others == "required" or name in base or name in renamed]
     if needed:
         listed = ", ".join(wanted[name] for name in needed[:8]) + (" ..." if len(needed) > 8 else "")
-        hint = 'Joints that do not move need no column with others = "zero"' if set(needed) - set(base) else ""
-        raise InputError(f"{path}: columns", "one for every joint of the model", f"{len(needed)} missing: {listed}", hint)
+        hint = (
+            'Joints that do not move need no column with others = "zero"' if set(needed) - set(base) else ""
+        )
+        raise InputError(
+            f"{path}: columns", "one for every joint of the model", f"{len(needed)} missing: {listed}", hint
+        )
     if not floating and len(missing) == len(joints):
         raise InputError(f"{path}: columns", "joints among " + ", ".join(joints), "none of them")
     used = [name for name in joints if name not in missing]
@@ -165,35 +181,38 @@ def _from_joints(
     t = t[keep]
     if t.size < 2:
         raise InputError("[motion]", "at least two frames", str(t.size))
-    angles = np.column_stack([columns[wanted[name]][keep] for name in used]) if used else np.zeros((t.size, 0))
+    angles = (
+        np.column_stack([columns[wanted[name]][keep] for name in used]) if used else np.zeros((t.size, 0))
+    )
     rate = get(motion, "rate", float, where, float(1.0 / np.median(np.diff(t))))
     if rate <= 0.0:
         raise InputError("[motion] rate", "a rate above 0 Hz", f"{rate:g}")
     dt = 1.0 / rate
-    window = _window(get(motion, "bandwidth", float, where, 6.0), dt)
     max_gap = get(motion, "max_gap", float, where, None)
     clock, uniform = resample_uniform(t, angles, dt, max_gap=max_gap, kind="cubic")
-    if clock.size < window:
-        raise InputError("[motion]", f"at least {window} frames ({window * dt:.3g} s) for the derivatives", str(clock.size))
     q = np.zeros((clock.size, model.nq))
-    v, a = np.zeros((clock.size, model.nv)), np.zeros((clock.size, model.nv))
-    at_q = [int(model.joints[model.getJointId(name)].idx_q) for name in used]
-    at_v = [int(model.joints[model.getJointId(name)].idx_v) for name in used]
-    q[:, at_q] = savgol_derivatives(uniform, dt, window, _ORDER, 0)
-    v[:, at_v] = savgol_derivatives(uniform, dt, window, _ORDER, 1)
-    a[:, at_v] = savgol_derivatives(uniform, dt, window, _ORDER, 2)
+    q[:, [int(model.joints[model.getJointId(name)].idx_q) for name in used]] = uniform
     if floating:
         position = np.column_stack([columns[wanted[name]][keep] for name in _POSITION])
         quaternion = np.column_stack([columns[wanted[name]][keep] for name in _QUATERNION])
-        _root(q, v, a, clock, dt, window, t, position, _unit(quaternion, path), max_gap)
-    good: BoolArray = np.asarray(np.isfinite(q).all(axis=1) & np.isfinite(v).all(axis=1) & np.isfinite(a).all(axis=1))
+        unit = _unit(quaternion, path)
+        q[:, :3] = resample_uniform(t, position, clock, max_gap=max_gap, kind="cubic")[1]
+        q[:, 3:7] = np.roll(resample_rotations(t, unit, clock, max_gap=max_gap, kind="cubic")[1], -1, axis=1)
+    try:
+        moved = differentiate_configurations(model, q, dt, get(motion, "bandwidth", float, where, 6.0))
+    except InputError as error:
+        raise InputError(f"[motion] {error.field}", error.expected, error.found, error.hint) from error
+    good = moved.good
     if not good.any():
-        raise InputError("[motion]", "a stretch without gaps that is longer than the filter of the derivatives", "none")
+        raise InputError(
+            "[motion]", "a stretch without gaps that is longer than the filter of the derivatives", "none"
+        )
     tree = PinocchioTree(model, gravity=gravity)
-    moved = tree.motion(clock[good], q[good], v[good], a[good])
     sd = get(motion, "angle_sd", float, where, None)
-    variance = None if sd is None else sd**2 * savgol_noise_gain(window, _ORDER, 2, dt)
-    return _known(clock, good, moved, variance)
+    variance = None if sd is None else sd**2 * moved.acceleration_gain
+    return _known(
+        clock, good, tree.motion(clock[good], moved.q[good], moved.qd[good], moved.qdd[good]), variance
+    )
 
 
 def _hinges(model: Any) -> list[str]:
@@ -202,14 +221,23 @@ def _hinges(model: Any) -> list[str]:
         if joint.nq == 1:
             out.append(str(name))
         elif joint.shortname() != "JointModelFreeFlyer":
-            raise InputError("[model] urdf", "joints of one coordinate each (revolute or prismatic)", f"{name}: {joint.shortname()}")
+            raise InputError(
+                "[model] urdf",
+                "joints of one coordinate each (revolute or prismatic)",
+                f"{name}: {joint.shortname()}",
+            )
     return out
 
 
 def _columns(path: Path, motion: Mapping[str, Any]) -> tuple[FloatArray, Mapping[str, FloatArray]]:
     suffix = path.suffix.lower()
     if suffix == ".trc":
-        raise InputError(f"[motion] file {path.name}", "joint angles over time", "markers", "Inverse kinematics has to come first")
+        raise InputError(
+            f"[motion] file {path.name}",
+            "joint angles over time",
+            "markers",
+            "Inverse kinematics has to come first",
+        )
     if suffix in (".mot", ".sto"):
         lengths = get(motion, "translations", tuple[str, ...], "[motion]", ())
         # A unit quaternion has no unit: its columns are no angles.
@@ -223,37 +251,13 @@ def _columns(path: Path, motion: Mapping[str, Any]) -> tuple[FloatArray, Mapping
     return columns["t"], columns
 
 
-def _window(bandwidth: float, dt: float) -> int:
-    try:
-        return choose_savgol(bandwidth, dt, _ORDER)
-    except InputError as error:
-        raise InputError("[motion] bandwidth", error.expected, error.found) from error
-
-
 def _unit(q: FloatArray, path: Path) -> FloatArray:
     norm = np.linalg.norm(q, axis=1)
     off = np.abs(norm - 1.0) > 1e-2
     if off.any():
-        raise InputError(f"{path}: qw, qx, qy, qz", "unit quaternions", f"norm {norm[off][0]:.4g} in {int(off.sum())} row(s)")
+        raise InputError(
+            f"{path}: qw, qx, qy, qz",
+            "unit quaternions",
+            f"norm {norm[off][0]:.4g} in {int(off.sum())} row(s)",
+        )
     return lie.continuous_quaternions(q / norm[:, None])
-
-
-def _root(
-    q: FloatArray, v: FloatArray, a: FloatArray, clock: FloatArray, dt: float, window: int,
-    t: FloatArray, position: FloatArray, quaternion: FloatArray, max_gap: float | None,
-) -> None:  # fmt: skip
-    """Fill in the free-flyer: pose in the world, velocity and acceleration in its own frame."""
-    p = resample_uniform(t, position, clock, max_gap=max_gap, kind="cubic")[1]
-    turned = differentiate_rotations(
-        resample_rotations(t, quaternion, clock, max_gap=max_gap, kind="cubic")[1], dt, window, _ORDER
-    )
-    smooth, first, second = (savgol_derivatives(p, dt, window, _ORDER, k) for k in (0, 1, 2))
-    R = lie.quaternion_wxyz_to_matrix(turned.rotation)
-    back = np.swapaxes(R, 1, 2)
-    q[:, :3], q[:, 3:7] = smooth, np.roll(turned.rotation, -1, axis=1)
-    v[:, :3], v[:, 3:6] = (back @ first[:, :, None])[..., 0], turned.angular_velocity
-    # The free-flyer's acceleration is the spatial one: without w x v.
-    a[:, :3] = (back @ second[:, :, None])[..., 0] - np.cross(v[:, 3:6], v[:, :3])
-    a[:, 3:6] = turned.angular_acceleration
-
-

@@ -19,6 +19,7 @@ Builder: TypeAlias = Callable[[Mapping[str, Any], Path], Problem]
 
 KINDS: dict[str, str] = {
     "grasp_pose": "factorgrasp.grasp_file:build",
+    "human_dynamics": "factorgrasp.human_dynamics_file:build",
 }
 """``"module:function"`` of the builder of every kind, imported when it is needed."""
 
@@ -47,6 +48,17 @@ class ProblemFile:
     problem: Problem
     title: str = ""
     solver: str | None = None
+
+    def solve(self, solver: str | None = None) -> Any:
+        """The typed view of the estimate; `solver` goes before the one that the file asks for."""
+        chosen = solver or self.solver
+        own = getattr(self.problem, "solve", None)
+        if own is not None:
+            # A recording of many frames is not one least-squares problem.
+            return own(chosen)
+        from factorgrasp import solve
+
+        return solve(self.problem, solver=chosen)
 
 
 def load_problem(path: str | os.PathLike[str]) -> ProblemFile:

@@ -74,9 +74,10 @@ class Quadratic:
         promised = np.where(curvature > rounding, pull**2 / np.maximum(curvature, rounding), 0.0)
         total = max(2.0 * (self.value + offset), 1e-12)
         if promised.sum() > total:
-            promised = np.minimum(promised, _cap(promised, total))
-        some = promised > 0.0
-        curvature[some] = pull[some] ** 2 / promised[some]
+            most = _cap(promised, total)
+            raised = promised > most
+            curvature[raised] = pull[raised] ** 2 / most
+            promised = np.minimum(promised, most)
         root = np.sqrt(curvature)
         A, b = np.zeros((size + 1, size)), np.zeros(size + 1)
         A[:size] = root[:, None] * vectors.T * scale

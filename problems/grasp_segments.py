@@ -111,7 +111,7 @@ class GraspSegments:
                 raise InputError(name, "a finite number above zero", repr(value), hint)
         self.segment_seconds, self.static = float(segment_seconds), static
         self.rotation_walk_sd, self.translation_walk_sd = float(rotation_walk_sd), float(translation_walk_sd)
-        self._refined = False
+        self._refined = self._final = False
         self._pose(problem, None)
 
     def _pose(self, problem: GraspPose, start: State | None) -> None:
@@ -202,6 +202,8 @@ class GraspSegments:
 
     def refine(self, state: State) -> GraspSegments | None:
         """Shift the clocks, re-weight the bands, drop needless sensor errors; None when all is settled."""
+        if self._final:
+            return None
         if self.static:
             fresh = self.problem.refine(state)
             return None if fresh is None else self._again(fresh, None)
@@ -253,11 +255,9 @@ class GraspSegments:
     def view(self, estimate: Estimate) -> GraspTrack:
         """The grasp over time, with the whole time offset."""
         if self.static:
-            return GraspTrack.from_pose(self.problem.view(estimate), float(self.t.mean()))
+            return GraspTrack.from_pose(self.problem.view(estimate), self, estimate.values)
         shift = float(estimate.values["time_offset"][0]) if "time_offset" in estimate.values else 0.0
-        numbers = np.array([factor.moments.numbers for factor in self.factors])
-        offset = self.problem.time_offset + shift
-        return GraspTrack.from_estimate(estimate, self.t, self._names, offset, numbers)
+        return GraspTrack.from_estimate(estimate, self, self._names, self.problem.time_offset + shift)
 
     # ---- as a gtsam graph
 
@@ -292,6 +292,22 @@ class GraspSegments:
         return self._graph.increments(self.graph_values(self._start if start is None else start))
 
     # ---- what other parts of the library read
+
+    def with_walk(
+        self, rotation_walk_sd: float = 1e-3, translation_walk_sd: float = 1e-3, static: bool = False
+    ) -> GraspSegments:
+        """The same segments with clocks and weights as they are now, not to be refined again, and another walk.
+
+        What :attr:`GraspTrack.log_evidence` compares: ``solve(track.problem.with_walk(...)).log_evidence``.
+        """
+        walk = (self.problem, self.segment_seconds, rotation_walk_sd, translation_walk_sd, static)
+        out = GraspSegments(*walk)
+        out._final = True
+        return out
+
+    def node_keys(self, k: int) -> tuple[int, ...]:
+        """The gtsam keys of the grasp that segment k sees: rotation and translation."""
+        return self._graph.keys.of(k)[:2]
 
     def log_evidence(self, state: State) -> float:
         """Logarithm of the likelihood of the data with all unknowns integrated out (Laplace), at a solution.

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,7 +14,10 @@ from factorgrasp.estimate import Estimate, TermSummary
 from factorgrasp.observability import Observability
 from factorgrasp.problems.grasp_estimate import GraspPoseEstimate
 from factorgrasp.status import Status
-from factorgrasp.typing import FloatArray, JsonDict
+from factorgrasp.typing import FloatArray, JsonDict, State
+
+if TYPE_CHECKING:
+    from factorgrasp.problems.grasp_segments import GraspSegments
 
 
 @dataclass(frozen=True)
@@ -36,6 +40,10 @@ class GraspTrack:
         s, hand clock minus robot clock.
     nodes : tuple of (str, str)
         Names of every segment's rotation and translation in `estimate`.
+    problem : GraspSegments
+        As it was posed last, with the clocks and weights that the data settled: for its graph and increments.
+    state : mapping
+        Solution of `problem` (the time offset in it is what remains beyond that of its clocks).
     """
 
     estimate: Estimate
@@ -45,17 +53,14 @@ class GraspTrack:
     covariance: FloatArray
     time_offset: float
     nodes: tuple[tuple[str, str], ...]
+    problem: GraspSegments = field(repr=False, compare=False)
+    state: State = field(repr=False, compare=False)
 
     @classmethod
     def from_estimate(
-        cls,
-        estimate: Estimate,
-        t: FloatArray,
-        nodes: Sequence[tuple[str, str]],
-        time_offset: float,
-        numbers: FloatArray,
+        cls, estimate: Estimate, problem: GraspSegments, nodes: Sequence[tuple[str, str]], time_offset: float
     ) -> GraspTrack:
-        """Typed view of a solver's answer; `numbers` (segments,) counts the independent numbers behind every segment's rows."""
+        """Typed view of a solver's answer to a grasp that wanders; `time_offset` (s) is the whole one."""
         covariance = np.full((len(nodes), 6, 6), np.nan)
         if estimate.covariance_source is not None:
             for k, names in enumerate(nodes):
@@ -63,28 +68,33 @@ class GraspTrack:
         values = dict(estimate.values)
         if "time_offset" in values:
             values["time_offset"] = np.array([time_offset])
+        numbers = np.array([factor.moments.numbers for factor in problem.factors])
         residuals = tuple(_counted(term, numbers) for term in estimate.residuals)
         return cls(
             estimate=replace(estimate, values=values, residuals=residuals),
-            t=t,
+            t=problem.t,
             rotation=np.stack([values[rotation] for rotation, _ in nodes]),
             translation=np.stack([values[translation] for _, translation in nodes]),
             covariance=covariance,
             time_offset=time_offset,
             nodes=tuple(nodes),
+            problem=problem,
+            state=estimate.values,
         )
 
     @classmethod
-    def from_pose(cls, pose: GraspPoseEstimate, t: float) -> GraspTrack:
+    def from_pose(cls, pose: GraspPoseEstimate, problem: GraspSegments, state: State) -> GraspTrack:
         """The answer to the unsegmented problem as a track of one node."""
         return cls(
             estimate=pose.estimate,
-            t=np.array([t]),
+            t=np.array([problem.t.mean()]),
             rotation=pose.rotation[None],
             translation=pose.translation[None],
             covariance=pose.covariance[None],
             time_offset=pose.time_offset,
             nodes=(("rotation", "translation"),),
+            problem=problem,
+            state=state,
         )
 
     @property
@@ -96,6 +106,11 @@ class GraspTrack:
     def message(self) -> str:
         """Why it ended so and what would help."""
         return self.estimate.message
+
+    @property
+    def log_evidence(self) -> float:
+        """How well the width of the walk explains the data; see :meth:`GraspSegments.log_evidence`."""
+        return self.problem.log_evidence(self.state)
 
     @property
     def observability(self) -> Observability | None:

@@ -20,6 +20,8 @@ _SLIP_EVIDENCE = 3.0
 _SHORTEST_SLIP = 8
 # A reference this far (tangent step) from the estimate before makes its snapshots worthless.
 _FAR = 0.2
+# Give of a firm hold, as part of the smallest change that is reported.
+_GIVE = 0.2
 
 
 @dataclass(frozen=True)
@@ -31,12 +33,17 @@ class DetectorSettings:
     log_bayes_factor : float
         Evidence that is needed.
     smallest_angle, smallest_distance : float
-        rad and m; a change that is smaller in both is not reported.
+        rad and m; a change that is smaller in both is not reported. No hold is quite rigid: a fifth of them counts as its give.
     """
 
     log_bayes_factor: float = 15.0
-    smallest_angle: float = float(np.deg2rad(0.5))
-    smallest_distance: float = 0.005
+    smallest_angle: float = float(np.deg2rad(1.0))
+    smallest_distance: float = 0.008
+
+    @property
+    def give(self) -> FloatArray:
+        """Variances (6,) of the slight changes that are no event, rad^2 and m^2."""
+        return np.repeat([(_GIVE * self.smallest_angle) ** 2, (_GIVE * self.smallest_distance) ** 2], 3)
 
 
 @dataclass(frozen=True)
@@ -101,7 +108,8 @@ class ChangeWatch:
         if self._reference is None:
             self.refer()
         assert self._reference is not None
-        self._detector.add_snapshot(time, local(self._model, self._reference, fit.state), self._fitter.covariance())
+        mean, covariance = local(self._model, self._reference, fit.state), self._loose(self._fitter.covariance())
+        self._detector.add_snapshot(time, mean, covariance)
         level = self._fitter.level
         assert level is not None
         self._moments.append(np.array([time]), level.moment().to_row()[None], False)
@@ -179,14 +187,14 @@ class ChangeWatch:
         _, state, _ = self._before(jump)
         known = Moment.from_row(self._moments.last(jump.segments)[0], self._fitter.long.bank.width)
         fit = self._fitter.with_sensor_errors(state, known)
-        normals = batched_normals(fit.model, fit.state, *self._segment_moments(jump.segments))
+        normals = batched_normals(fit.model, fit.state, self._segment_moments(jump.segments), self._fitter.short.window_noise)
         cost, gradient, information = (part.sum(axis=0) for part in normals)
         data = Segments(
             [jump.segments],
             np.array([cost]),
             np.array([jump.segments * self._fitter.short.residuals]),
             np.zeros((1, fit.model.size)),
-            fit.covariance()[None],
+            self._loose(fit.covariance())[None],
             gradient[None],
             information[None],
             gradient[None, :GRASP],
@@ -198,6 +206,12 @@ class ChangeWatch:
             return None
         return replace(surer, evidence=jump.evidence)
 
+    def _loose(self, covariance: FloatArray) -> FloatArray:
+        """A covariance (n, n) with the give of the hold added."""
+        out = covariance.copy()
+        out[range(GRASP), range(GRASP)] += self._settings.give
+        return out
+
     def _segment_moments(self, count: int) -> tuple[FloatArray, FloatArray]:
         short = self._fitter.short
         c = self._coefficients.last(count).reshape(count, short.bank.windowing.bins, 2, -1)
@@ -207,7 +221,9 @@ class ChangeWatch:
         assert self._reference is not None
         if count == 0:
             return
-        normals = batched_normals(self._model, self._reference, *self._segment_moments(count))
+        normals = batched_normals(
+            self._model, self._reference, self._segment_moments(count), self._fitter.short.window_noise
+        )
         self._detector.add_segments(self._coefficients.last_times(count), *normals, self._fitter.short.residuals)
 
     def _before(self, jump: Jump) -> tuple[float, State, FloatArray]:

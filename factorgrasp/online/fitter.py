@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from factorgrasp.online.level import Level
-from factorgrasp.online.moment_solver import Fit, GaussianPrior, Moment, descend
+from factorgrasp.online.moment_solver import Fit, GaussianPrior, Moment, descend, evaluate
 from factorgrasp.problems.grasp_model import GraspModel
 from factorgrasp.problems.grasp_model_check import ModelCheck, check_model
 from factorgrasp.problems.grasp_settings import GraspNoise, GraspPrior, GraspSettings
@@ -177,15 +177,17 @@ class GraspFitter:
 
     def _checked(self, level: Level) -> ModelCheck:
         assert self.fit is not None
+        # The check takes differences of large matrices, which must belong to the very same state.
+        fit = evaluate(self.model, self.fit.state, level.moment(), self.prior)
         return check_model(
             self.model,
-            self.fit.state,
+            fit.state,
             level.bank.moments(),
             level.expected,
             level.variances,
             np.diag(self.prior.information),
-            self.fit.information,
-            self.fit.meat,
+            fit.information,
+            fit.meat,
             level.bank.windowing.frequencies,
             self._settings.errors_in_variables,
         )

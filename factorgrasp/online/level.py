@@ -65,12 +65,17 @@ class Level:
         return Moment(gyro - count * self._noise_g, accelerometer - count * self._noise_a, *squared)
 
     def segment_moments(self, c_g: FloatArray, c_a: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The same (N, 10, 10) and (N, m, m) of single windows with coefficients (N, K, 2, c)."""
+        """Weighted sums (N, 10, 10) and (N, m, m) of single windows with coefficients (N, K, 2, c), noise not taken out."""
         out = []
-        for c, weight, noise in zip((c_g, c_a), self.variances.weights, (self._noise_g, self._noise_a), strict=True):
+        for c, weight in zip((c_g, c_a), self.variances.weights, strict=True):
             flat = c.reshape(c.shape[0], -1, c.shape[3])
-            out.append(np.matmul(flat.transpose(0, 2, 1) * np.repeat(weight, 2), flat) - noise)
+            out.append(np.matmul(flat.transpose(0, 2, 1) * np.repeat(weight, 2), flat))
         return out[0], out[1]
+
+    @property
+    def window_noise(self) -> tuple[FloatArray, FloatArray]:
+        """Expected noise (10, 10) and (m, m) in the weighted sums of one half-overlapping window."""
+        return self._noise_g, self._noise_a
 
     def relative_power(self, sensor: int, power: FloatArray) -> FloatArray:
         """Whitened residual power (N,) of single windows, from their power per bin (N, K), relative to its running median."""

@@ -113,15 +113,18 @@ def _rotation_between(A: FloatArray, B: FloatArray) -> FloatArray:
 
 
 def batched_normals(
-    model: GraspModel, state: State, Z_g: FloatArray, Z_a: FloatArray
+    model: GraspModel, state: State, moments: tuple[FloatArray, FloatArray], noise: tuple[FloatArray, FloatArray]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Costs (S,), gradients (S, n) and Gauss-Newton matrices (S, n, n) of moments (S, 10, 10) and (S, m, m)."""
-    cost, gradient, information = np.zeros(Z_g.shape[0]), np.zeros(1), np.zeros(1)
-    for L, J, Z in zip(model.matrices(state), model.jacobians(state), (Z_g, Z_a), strict=True):
+    """Costs (S,), gradients (S, n) and covariances of these (S, n, n) of `moments` (S, 10, 10) and (S, m, m) with expected `noise` in each.
+
+    The noise is taken out of the gradients only: the covariance of a gradient has it in, and stays positive semidefinite.
+    """
+    cost, gradient, information = np.zeros(1), np.zeros(1), np.zeros(1)
+    for L, J, Z, E in zip(model.matrices(state), model.jacobians(state), moments, noise, strict=True):
         n, width = J.shape[0], J.shape[2]
         JZ = np.matmul(J.reshape(-1, width), Z).reshape(-1, n, 3 * width)
         cost = cost + 0.5 * np.matmul(np.matmul(L, Z).reshape(-1, 3 * width), L.ravel())
-        gradient = gradient + np.matmul(JZ, L.ravel())
+        gradient = gradient + np.matmul(JZ - (J.reshape(-1, width) @ E).reshape(n, -1), L.ravel())
         information = information + np.matmul(JZ, J.reshape(n, -1).T)
     return cost, gradient, information
 
@@ -144,23 +147,43 @@ def descend(
         for a warm start.
     """
     Z_g, Z_a = _positive(moment.gyro), _positive(moment.accelerometer)
-    state = dict(start)
+    state, cost, gained = dict(start), 0.0, 0.0
     for _ in range(iterations):
-        L_g, L_a = model.matrices(state)
-        J_g, J_a = model.jacobians(state)
-        gyro, accelerometer = quadratic_forms(L_g, J_g, Z_g), quadratic_forms(L_a, J_a, Z_a)
-        error = _prior_error(model, prior, state)
-        pull = prior.information @ error
-        gradient = gyro[1] + accelerometer[1] + pull
-        H = gyro[2] + accelerometer[2] + prior.information
+        cost, gradient, H, J_g, J_a = _normal(model, state, Z_g, Z_a, prior)
         step = -np.linalg.solve(H, gradient)
         state = retract(model, state, step)
         gained = -float(step @ gradient)
         if gained < tolerance**2:
             break
-    cost = gyro[0] + accelerometer[0] + 0.5 * float(error @ pull) - 0.5 * gained
-    meat = quadratic_forms(L_g, J_g, moment.gyro_squared)[2] + quadratic_forms(L_a, J_a, moment.accelerometer_squared)[2]
-    return Fit(model, state, cost, H, meat + prior.information)
+    return Fit(model, state, cost - 0.5 * gained, H, _meat(J_g, J_a, moment, prior))
+
+
+def evaluate(model: GraspModel, state: State, moment: Moment, prior: GaussianPrior) -> Fit:
+    """The same without a step: all matrices at `state` itself."""
+    Z_g, Z_a = _positive(moment.gyro), _positive(moment.accelerometer)
+    cost, _, H, J_g, J_a = _normal(model, state, Z_g, Z_a, prior)
+    return Fit(model, state, cost, H, _meat(J_g, J_a, moment, prior))
+
+
+def _normal(
+    model: GraspModel, state: State, Z_g: FloatArray, Z_a: FloatArray, prior: GaussianPrior
+) -> tuple[float, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Cost, gradient, Gauss-Newton matrix, and the Jacobians of both residual matrices."""
+    L_g, L_a = model.matrices(state)
+    J_g, J_a = model.jacobians(state)
+    gyro, accelerometer = quadratic_forms(L_g, J_g, Z_g), quadratic_forms(L_a, J_a, Z_a)
+    error = _prior_error(model, prior, state)
+    pull = prior.information @ error
+    cost = gyro[0] + accelerometer[0] + 0.5 * float(error @ pull)
+    return cost, gyro[1] + accelerometer[1] + pull, gyro[2] + accelerometer[2] + prior.information, J_g, J_a
+
+
+def _meat(J_g: FloatArray, J_a: FloatArray, moment: Moment, prior: GaussianPrior) -> FloatArray:
+    out = prior.information
+    for J, Z in ((J_g, moment.gyro_squared), (J_a, moment.accelerometer_squared)):
+        n, width = J.shape[0], J.shape[2]
+        out = out + (J.reshape(-1, width) @ Z).reshape(n, -1) @ J.reshape(n, -1).T
+    return out
 
 
 def _prior_error(model: GraspModel, prior: GaussianPrior, state: State) -> FloatArray:

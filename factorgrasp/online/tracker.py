@@ -109,9 +109,13 @@ class GraspTracker:
         first = 0
         while first < t.size:
             count = min(t.size - first, self.segment - self._since_segment)
-            part = slice(first, first + count)
-            self.history.append(t[part], z[part], starts and first == 0)
-            self._count(z[part])
+            rows = z[first : first + count]
+            if self._clock_shift != 0.0:
+                # Read before the last review moved the clock.
+                rows = rows.copy()
+                shift_hand(rows, self._clock_shift)
+            self.history.append(t[first : first + count], rows, starts and first == 0)
+            self._count(rows)
             self._since_segment += count
             hops, self._since_hop = divmod(self._since_hop + count, self.hop)
             if hops:

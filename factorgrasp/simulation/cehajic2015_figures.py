@@ -295,11 +295,6 @@ def _draw_curve(above: Axes, below: Axes, curve: ErrorCurve, label: str, colour:
     wild = label == _LITERAL
     every = slice(None, None, max(1, curve.t.size // (600 if wild else 2400)))
     t = curve.t[every]
-    if label in _COMPONENTS:
-        light = _COMPONENTS[label]
-        above.plot(t, curve.quaternion_error[every], color=light, linewidth=0.5)
-        lines = below.plot(t, curve.translation_error[every], color=light, linewidth=0.5)
-        lines[0].set_label("its components")
     marker = "o" if t.size <= _FEW_POINTS else ""
     above.plot(
         t,
@@ -321,6 +316,11 @@ def _draw_curve(above: Axes, below: Axes, curve: ErrorCurve, label: str, colour:
         label=label,
         zorder=3,
     )
+    if label in _COMPONENTS:
+        light = _COMPONENTS[label]
+        above.plot(t, curve.quaternion_error[every], color=light, linewidth=0.5, zorder=1)
+        lines = below.plot(t, curve.translation_error[every], color=light, linewidth=0.5, zorder=1)
+        lines[0].set_label("its components")
     for axes, band, name in (
         (above, curve.quaternion_band, ""),
         (below, curve.translation_band, "95 % band of its own covariance"),

@@ -58,3 +58,41 @@ def random_states(model: Any, count: int, seed: int = 0) -> tuple[FloatArray, Fl
     v = rng.standard_normal((count, model.nv))
     q = np.array([pin.integrate(model, pin.neutral(model), 0.6 * rng.standard_normal(model.nv)) for _ in range(count)])
     return q, v, 3.0 * rng.standard_normal((count, model.nv))
+
+
+def smooth_states(model: Any, count: int, rate: float = 100.0, seed: int = 0) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Times and consistent (q, qd, qdd) of gentle sines; only for models without a free-flyer or ball joints."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(count) / rate
+    w, phase, size = (rng.uniform(*span, model.nv) for span in ((1.0, 3.0), (0.0, 6.0), (0.1, 0.4)))
+    angle = w * t[:, None] + phase
+    return t, size * np.sin(angle), size * w * np.cos(angle), -size * w**2 * np.sin(angle)
+
+
+def random_wrenches(links: tuple[str, ...], count: int, seed: int = 1) -> dict[str, FloatArray]:
+    """Wrenches (n, 6) of tens of newtons on every one of `links`."""
+    rng = np.random.default_rng(seed)
+    return {link: rng.standard_normal((count, 6)) * np.array([40.0, 40.0, 40.0, 4.0, 4.0, 4.0]) for link in links}
+
+
+def standing(count: int = 40, seed: int = 0, carried: dict[str, FloatArray] | None = None) -> tuple[Any, dict[str, FloatArray]]:
+    """A floating body in random motion, with the wrenches on both feet that its motion and what it carries demand (shared at random)."""
+    from dataclasses import replace
+
+    from factorgrasp.baselines.inverse_dynamics import inverse_dynamics
+    from factorgrasp.problems.link_motion_pinocchio import from_pinocchio
+
+    model = body()
+    q, v, a = random_states(model, count, seed)
+    motion = replace(from_pinocchio(model, np.arange(count) / 100.0, q, v, a))
+    wrenches = {"left_foot": random_wrenches(("left_foot",), count, seed)["left_foot"], **(carried or {})}
+    residual = inverse_dynamics(motion, wrenches).root_residual
+    root, foot = motion.root, motion.link("right_foot")
+    # The root's residual, moved to the right foot.
+    F = motion.R[:, root] @ residual[:, :3, None]
+    M = motion.R[:, root] @ residual[:, 3:, None]
+    arm = motion.p[:, root] - motion.p[:, foot]
+    M = M[..., 0] + np.cross(arm, F[..., 0])
+    back = np.swapaxes(motion.R[:, foot], 1, 2)
+    wrenches["right_foot"] = np.concatenate([(back @ F)[..., 0], (back @ M[..., None])[..., 0]], axis=1)
+    return motion, wrenches

@@ -1,0 +1,161 @@
+"""The tables of a problem file with ``kind = "human_dynamics"``.
+
+[model], [motion], [[forces]], [[sensors]], [covariance], [contacts], [constraints].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from factorgrasp.errors import InputError
+from factorgrasp.human_dynamics_inputs import (
+    PLATE_COVARIANCE,
+    Six,
+    mounting,
+    read_sensors,
+    read_wrenches,
+)
+from factorgrasp.human_dynamics_motion import BodyMotion, read_body_motion
+from factorgrasp.human_dynamics_task import HumanDynamicsTask
+from factorgrasp.problems.human_dynamics import HumanDynamics
+from factorgrasp.problems.human_dynamics_constraints import DynamicsConstraint, TorqueLimit, feet_on_the_floor
+from factorgrasp.problems.human_dynamics_settings import HumanDynamicsNoise, PerName
+from factorgrasp.toml_tables import check_keys, close_matches, convert, get, place, sub_table
+
+TABLES = ("model", "motion", "forces", "sensors", "covariance", "contacts", "constraints")
+PRESETS = ("default", "latella2018", "tirupachuri2021")
+
+_NOISE = tuple(field.name for field in fields(HumanDynamicsNoise))
+_OF_JOINTS = ("propagation", "joint_acceleration", "prior_joint_wrench", "prior_joint_acceleration")
+_Number = float | tuple[float, ...]
+
+
+def build(table: Mapping[str, Any], base_dir: Path) -> HumanDynamicsTask:
+    """The human-dynamics problem of a problem file.
+
+    Parameters
+    ----------
+    table : mapping
+        The tables of the file.
+    base_dir : Path
+        Folder that its paths are relative to.
+
+    Raises
+    ------
+    InputError
+        Naming the table and the key, or the recording and the column.
+    """
+    check_keys(table, TABLES, "")
+    contacts, constraints = sub_table(table, "contacts"), sub_table(table, "constraints")
+    check_keys(contacts, ("unmeasured", "payload"), "[contacts]")
+    check_keys(
+        constraints,
+        ("feet", "friction", "corners", "position", "rotation_wxyz", "torque_limits", "hard_dynamics"),
+        "[constraints]",
+    )
+    covariance = sub_table(table, "covariance")
+    check_keys(covariance, ("preset", "plate", *_NOISE), "[covariance]")
+    plate = get(covariance, "plate", Six, "[covariance]", PLATE_COVARIANCE)
+
+    body = read_body_motion(table, base_dir)
+    noise = _noise(covariance, body)
+    wrenches = read_wrenches(table, body, base_dir, plate)
+    sensors = [*wrenches, *read_sensors(table, body, base_dir)]
+    unmeasured = _links(contacts, "unmeasured", body)
+    payload = _links(contacts, "payload", body)
+    for link in payload:
+        if link not in unmeasured:
+            raise InputError("[contacts] payload", "links of [contacts] unmeasured", repr(link))
+    problem = HumanDynamics(
+        body.motion,
+        sensors,
+        noise,
+        unmeasured,
+        _constraints(constraints, body),
+        hard_dynamics=get(constraints, "hard_dynamics", bool, "[constraints]", False),
+    )
+    return HumanDynamicsTask(problem, body.clock, body.good, payload)
+
+
+def _noise(covariance: Mapping[str, Any], body: BodyMotion) -> HumanDynamicsNoise:
+    preset = get(
+        covariance, "preset", Literal["default", "latella2018", "tirupachuri2021"], "[covariance]", "default"
+    )
+    noise = {
+        "default": HumanDynamicsNoise,
+        "latella2018": HumanDynamicsNoise.latella2018,
+        "tirupachuri2021": HumanDynamicsNoise.tirupachuri2021,
+    }[preset]()
+    if body.acceleration_variance is not None:
+        noise = replace(noise, joint_acceleration=body.acceleration_variance)
+    stated: dict[str, PerName] = {}
+    for key in _NOISE:
+        if key in covariance:
+            known = [j.name for j in body.motion.joints] if key in _OF_JOINTS else list(body.motion.links)
+            stated[key] = _per_name(covariance[key], known, place("[covariance]", key))
+    return replace(noise, **stated)
+
+
+def _per_name(value: Any, known: Sequence[str], field: str) -> PerName:
+    """A variance, one a component, or either by name."""
+    if not isinstance(value, Mapping):
+        return convert(value, _Number, field)  # type: ignore[no-any-return]
+    for name in value:
+        if name != "default" and name not in known:
+            raise InputError(
+                f"{field} {name}", "a name of the model, or default", "none", close_matches(name, known)
+            )
+    return {name: convert(one, _Number, f"{field} {name}") for name, one in value.items()}
+
+
+def _links(contacts: Mapping[str, Any], key: str, body: BodyMotion) -> tuple[str, ...]:
+    links: tuple[str, ...] = get(contacts, key, tuple[str, ...], "[contacts]", ())
+    for link in links:
+        if link not in body.motion.links:
+            raise InputError(
+                place("[contacts]", key),
+                "links of the model",
+                repr(link),
+                close_matches(link, body.motion.links),
+            )
+    return links
+
+
+def _constraints(table: Mapping[str, Any], body: BodyMotion) -> list[DynamicsConstraint]:
+    where = "[constraints]"
+    out: list[DynamicsConstraint] = []
+    feet: tuple[str, ...] = get(table, "feet", tuple[str, ...], where, ())
+    for link in feet:
+        if link not in body.motion.links:
+            raise InputError(
+                place(where, "feet"), "links of the model", repr(link), close_matches(link, body.motion.links)
+            )
+    if feet:
+        R, p = mounting(table, where)
+        corners = (
+            get(table, "corners", tuple[tuple[float, float], ...], where, None)
+            if "corners" in table
+            else None
+        )
+        made = feet_on_the_floor(feet, get(table, "friction", float, where, 0.7), R_l_s=R, p_l_s=p)
+        if corners is not None:
+            made = feet_on_the_floor(feet, get(table, "friction", float, where, 0.7), np.array(corners), R, p)
+        out += made
+    else:
+        for key in ("friction", "corners", "position", "rotation_wxyz"):
+            if key in table:
+                raise InputError(place(where, key), "feet in the same table", "none")
+    known = [joint.name for joint in body.motion.joints]
+    for joint, limit in sub_table(table, "torque_limits").items():
+        field = f"[constraints.torque_limits] {joint}"
+        if joint not in known:
+            raise InputError(field, "a joint of the model", "none", close_matches(joint, known))
+        low, high = limit if isinstance(limit, list) and len(limit) == 2 else (None, limit)
+        upper = convert(high, float, field)
+        out.append(TorqueLimit(joint, -upper if low is None else convert(low, float, field), upper))
+    return out
