@@ -107,7 +107,8 @@ class IDynTreePeer:
             else:
                 variance[where] = {"joint": c.joint_acceleration, "accelerometer": c.accelerometer}.get(kind, c.momentum_rate)
         self.sensor_variance = variance
-        self.solver.setDynamicsConstraintsPriorCovariance(self._diagonal(np.full(self.rows, c.model)))
+        if self.rows:
+            self.solver.setDynamicsConstraintsPriorCovariance(self._diagonal(np.full(self.rows, c.model)))
         self.solver.setDynamicsRegularizationPriorCovariance(self._diagonal(np.full(self.size, c.prior)))
         self.solver.setDynamicsRegularizationPriorExpectedValue(self.idt.VectorDynSize.FromPython([0.0] * self.size))
         self.solver.setMeasurementsPriorCovariance(self._diagonal(variance))

@@ -65,28 +65,26 @@ def solve_with_payload(
     """
     from factorgrasp.solvers.frames import solve_frames
 
-    # A sensor without a single value: all it does is that the joint covariance of the hands' wrenches is worked out.
-    blank = WrenchSet(np.full((len(problem), 6 * len(links)), np.nan), 1.0, _NAME, links=links)
-    system = problem.system
+    # The zeros that stand for these links' wrenches as one measurement of all of them: the same rows, and their joint covariance is known.
+    motion, system = problem.motion, problem.system
+    loose = resolve(problem.noise.contact_wrench, motion.links, [6] * len(motion.links), "contact_wrench")
+    variances = np.concatenate([loose[motion.link(link)] for link in links])
+    zeros = WrenchSet(np.zeros((len(problem), variances.size)), np.diag(variances), _NAME, links=links)
+    others = tuple(link for link in system.contacts if link not in links)
     watched = HumanDynamics(
-        problem.motion,
-        (*problem.sensors, blank),
-        problem.noise,
-        system.contacts,
-        problem.constraints,
-        system.hard_dynamics,
+        motion, (*problem.sensors, zeros), problem.noise, others, problem.constraints, system.hard_dynamics
     )
     keeper = _Keeper(watched)
     frames: HumanDynamicsEstimate = solve_frames(keeper, solver)
-    system = watched.system
-    group = system.touched(next(rows for rows in system.sensors if rows.name == _NAME))
+    found = watched.system
+    group = found.touched(next(rows for rows in found.sensors if rows.name == _NAME))
     P = next(
         block
-        for where, block in zip(system.marginals, keeper.result.marginals, strict=True)
+        for where, block in zip(found.marginals, keeper.result.marginals, strict=True)
         if np.array_equal(where, group)
     )
     payload = _mass(watched, links, keeper.result.x[:, group], P)
-    kept = tuple(found for found in frames.innovations if found.name != _NAME)
+    kept = tuple(one for one in frames.innovations if one.name != _NAME)
     return replace(frames, innovations=kept), payload
 
 

@@ -51,6 +51,8 @@ class GraspDiagnostics:
         Of the coarse time-offset search.
     bandwidth, kinematics_bandwidth : float
         Hz.
+    slow_force_residual : float
+        Root mean square per axis of the specific forces' disagreement in the two lowest bands, m/s^2.
     """
 
     t: FloatArray
@@ -74,6 +76,7 @@ class GraspDiagnostics:
     clock_ambiguity: float
     bandwidth: float
     kinematics_bandwidth: float
+    slow_force_residual: float
 
 
 @dataclass(frozen=True)
@@ -121,14 +124,12 @@ class GraspPoseEstimate(EstimateView, PoseView):
         if "time_offset" in names:
             values["time_offset"] = np.array([total])
         diagnostics = problem.diagnostics(state)
-        estimate = replace(estimate, values=values, residuals=_summaries(estimate, problem, state))
+        estimate = replace(estimate, values=values, residuals=_summaries(estimate, problem, diagnostics))
         if diagnostics.clock_correlation < SMALLEST_CORRELATION:
             words = grasp_words.unrelated(diagnostics.clock_correlation, diagnostics.rate_moment)
             estimate = replace(estimate, status=Status.UNOBSERVABLE, message=words)
-        elif "accelerometer_bias" in names:
-            words = grasp_words.contradiction(
-                values["accelerometer_bias"], problem.noise.accelerometer_bias_sd
-            )
+        else:
+            words = grasp_words.contradiction(values, problem.noise, diagnostics.slow_force_residual)
             if words:
                 estimate = replace(estimate, status=Status.NOT_CONVERGED, message=words)
 
@@ -258,14 +259,16 @@ def _triple(values: FloatArray, digits: int) -> str:
     return " ".join(f"{v:.{digits}f}" for v in np.atleast_1d(values))
 
 
-def _summaries(estimate: Estimate, problem: GraspPose, state: object) -> tuple[TermSummary, ...]:
+def _summaries(
+    estimate: Estimate, problem: GraspPose, diagnostics: GraspDiagnostics
+) -> tuple[TermSummary, ...]:
     """Residual summaries counted in independent numbers of the recording, not in compressed rows."""
     dof = problem.moments.dof.sum(axis=0)
     counts = {
         "gyroscope": round(3.0 * float(dof.sum())),
         "accelerometer": round(3.0 * float(dof[problem.variances.trusted].sum())),
     }
-    weights = problem.diagnostics(state).window_weight  # type: ignore[arg-type]
+    weights = diagnostics.window_weight
     relative = weights / max(float(weights.max()), 1e-300)
     out = []
     for term in estimate.residuals:

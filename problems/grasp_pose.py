@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from factorgrasp import rotation_relaxation
 from factorgrasp.errors import InputError
 from factorgrasp.estimate import Estimate
 from factorgrasp.least_squares import LeastSquares
@@ -173,16 +174,23 @@ class GraspPose:
         self._trust: FloatArray | None = None
         self._pruned = False
         self._checked: ModelCheck | None = None
+        self._cached: tuple[tuple[Moments, GraspWeights], FloatArray, FloatArray] | None = None
 
     # ---- the protocol of a nonlinear problem
     # -----------------------------------------------------------------
 
     def initial_state(self) -> State:
-        """Rotation by Wahba's closed form from the angular rates; everything else at its prior mean."""
+        """Rotation by Wahba's closed form, the cheaper of rates alone and rates with forces; the rest at its prior mean."""
         if self._start is not None:
             return self._start
-        gain = np.tensordot(self._weights.variances.weights[0], self._moments.gyro.sum(axis=0), 1)
-        return {**self._blank_state(), "rotation": wahba_start(gain[:3, 3:6], self.prior)}
+        w_g, w_a = self._weights.variances.weights
+        turn = np.tensordot(w_g, self._moments.gyro.sum(axis=0), 1)[0:3, 3:6]
+        pull = np.tensordot(w_a, self._moments.accelerometer.sum(axis=0), 1)[0:3, 12:15]
+        # Rates alone leave the angle about a constant axis to chance; forces alone misread a long lever arm.
+        starts = np.stack([wahba_start(turn, self.prior), wahba_start(turn + pull, self.prior)])
+        state = {**self._blank_state(), "rotation": starts[0]}
+        costs = rotation_relaxation.rotation_cost(self._rotation_cost(state), starts)
+        return {**state, "rotation": starts[int(np.argmin(costs))]}
 
     def linearize(self, state: State) -> LeastSquares:
         """Compressed rows: ``e = L(x) S`` with ``S S'`` the weighted, noise-corrected moments, and one row a prior component."""
@@ -192,9 +200,8 @@ class GraspPose:
             )
         L_g, L_a = self.model.matrices(state)
         J_g, J_a = self.model.jacobians(state)
-        Z_g, Z_a = self.corrected_moments()
-        for name, L, J, Z in (("gyroscope", L_g, J_g, Z_g), ("accelerometer", L_a, J_a, Z_a)):
-            root = positive_part(Z)
+        root_g, root_a = self._roots()
+        for name, L, J, root in (("gyroscope", L_g, J_g, root_g), ("accelerometer", L_a, J_a, root_a)):
             term = self._pattern.terms[name]
             rows = J @ root
             blocks = {v: rows[self.model.columns[v]].reshape(-1, term.rows).T for v in term.variables}
@@ -259,16 +266,7 @@ class GraspPose:
 
     def escape(self, state: State) -> State | None:
         """A start in the basin of a better rotation, or None when this one is the global optimum or nothing better is found."""
-        Z_g, Z_a = self.corrected_moments()
-        Q = rotation_cost(
-            self.model,
-            state,
-            _projected(Z_g),
-            _projected(Z_a),
-            prior_precision(self.model, self.noise, self.prior),
-            self.prior,
-        )
-        rotation = better_rotation(Q, state["rotation"])
+        rotation = better_rotation(self._rotation_cost(state), state["rotation"])
         return None if rotation is None else {**self._blank_state(), "rotation": rotation}
 
     def score_covariance(self, state: State) -> FloatArray:
@@ -389,6 +387,7 @@ class GraspPose:
             clock_ambiguity=self.clock.ambiguity,
             bandwidth=self.bandwidth,
             kinematics_bandwidth=self.kinematics_bandwidth,
+            slow_force_residual=float(np.sqrt(np.sum(power_a[:2] * windowing.dof[:2]) / windowing.dof.sum())),
         )
 
     # ---- internals
@@ -416,6 +415,17 @@ class GraspPose:
             for v in self.model.variables
         ]
         return float(np.max(np.abs(np.concatenate(steps))))
+
+    def _rotation_cost(self, state: State) -> FloatArray:
+        root_g, root_a = self._roots()
+        return rotation_cost(
+            self.model,
+            state,
+            root_g @ root_g.T,
+            root_a @ root_a.T,
+            prior_precision(self.model, self.noise, self.prior),
+            self.prior,
+        )
 
     def _blank_state(self) -> dict[str, FloatArray]:
         state = {variable.name: np.zeros(variable.size) for variable in self.model.variables}
@@ -482,11 +492,19 @@ class GraspPose:
             out += total / max(float(np.median(total)), 1e-300)
         return np.asarray(np.sqrt(0.5 * out))
 
+    def _roots(self) -> tuple[FloatArray, FloatArray]:
+        """Roots (m, rank) of the positive parts of both corrected moments; they change only with moments and weights."""
+        key = (self._moments, self._weights)
+        if self._cached is None or any(a is not b for a, b in zip(self._cached[0], key, strict=True)):
+            Z_g, Z_a = self.corrected_moments()
+            self._cached = (key, positive_part(Z_g), positive_part(Z_a))
+        return self._cached[1:]
+
     def _information(self, state: State) -> FloatArray:
         L_g, L_a = self.model.matrices(state)
         J_g, J_a = self.model.jacobians(state)
-        Z_g, Z_a = self.corrected_moments()
-        H = quadratic_forms(L_g, J_g, _projected(Z_g))[2] + quadratic_forms(L_a, J_a, _projected(Z_a))[2]
+        root_g, root_a = self._roots()
+        H = quadratic_forms(L_g, J_g, root_g @ root_g.T)[2] + quadratic_forms(L_a, J_a, root_a @ root_a.T)[2]
         return np.asarray(H + np.diag(prior_precision(self.model, self.noise, self.prior)))
 
     def _model_meat(self, state: State) -> FloatArray:
@@ -501,11 +519,6 @@ class GraspPose:
         meat = quadratic_forms(L_g, J_g, np.tensordot(w_g, gyro.sum(axis=0), 1))[2]
         meat = meat + quadratic_forms(L_a, J_a, np.tensordot(w_a, accelerometer.sum(axis=0), 1))[2]
         return np.asarray(meat + np.diag(prior_precision(self.model, self.noise, self.prior)))
-
-
-def _projected(Z: FloatArray) -> FloatArray:
-    root = positive_part(Z)
-    return np.asarray(root @ root.T)
 
 
 def checked_gravity(gravity: Sequence[float] | FloatArray) -> FloatArray:

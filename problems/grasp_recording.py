@@ -8,6 +8,7 @@ import numpy as np
 
 from factorgrasp import signals
 from factorgrasp.errors import InputError
+from factorgrasp.problems.grasp_averaging import average, averaged_samples
 from factorgrasp.problems.grasp_kinematics import RobotKinematics, gap_limit, uniform_grid
 from factorgrasp.problems.grasp_model import VECH
 from factorgrasp.problems.grasp_settings import GraspSettings
@@ -21,8 +22,6 @@ SMALLEST_CORRELATION = 0.5
 _LARGEST_GAIN = 1.3
 # Steps by which two uniform clocks may drift apart over a recording and still be called the same grid.
 _DRIFT = 1e-3
-# Samples a second that z keeps for every Hz of bandwidth; enough that vibration does not fold into the band.
-_RATE_OVER_BANDWIDTH = 10.0
 
 
 @dataclass(frozen=True)
@@ -137,19 +136,6 @@ class CouplingGrid:
         return CoupledWindows(gyro, accelerometer, centres[good], int(np.count_nonzero(~good)))
 
 
-def averaged_samples(step: float, bandwidth: float) -> int:
-    """How many samples of a grid with this step (s) one entry of z averages, for relations used up to `bandwidth` (Hz)."""
-    return max(1, int(1.0 / (step * _RATE_OVER_BANDWIDTH * bandwidth) + 1e-6))
-
-
-def average(x: FloatArray, samples: int) -> FloatArray:
-    """Means (n // samples, c) of consecutive samples of x (n, c); a NaN spoils its mean."""
-    if samples == 1:
-        return x
-    count = x.shape[0] // samples
-    return np.asarray(x[: count * samples].reshape(count, samples, -1).mean(axis=1))
-
-
 def vech_products(w: FloatArray) -> FloatArray:
     """``vech(w w')`` of every row, (n, 6)."""
     out = np.empty((w.shape[0], 6))
@@ -188,18 +174,23 @@ def coupling_grid(
         if robot.rotation is None:
             raise InputError("estimate.base_tilt", "a robot stream with orientations", "one without")
         parts += [np.matmul(robot.rotation.transpose(0, 2, 1), tilt[:, i]) for i in (0, 1)]
-    z = np.hstack([robot.angular_velocity, *parts])
-    t = robot.t
-    if hand_rate > 1.05 / robot.step:
-        # The hand is sampled faster: its extra samples carry information, so the smooth robot side goes onto
-        # a finer grid.
-        t = robot.t[0] + np.arange(int((robot.t[-1] - robot.t[0]) * hand_rate) + 1) / hand_rate
-        z = signals.resample_uniform(robot.t, z, t, max_gap=1.6 * robot.step, kind="cubic")[1]
-    step = float((t[-1] - t[0]) / (t.size - 1))
-    averaged = averaged_samples(step, bandwidth)
-    z, fine = average(z, averaged), t
-    t = average(t[:, None], averaged)[:, 0]
-    windowing = Windowing.for_grid(averaged * step, window, bandwidth, t.size)
+    z, t, step = np.hstack([robot.angular_velocity, *parts]), robot.t, robot.step
+    if robot.averaged > 1:
+        # The robot's signals are means over their step already; the hand's are averaged over the same.
+        averaged = max(robot.averaged, round(hand_rate * step))
+        inside = ((np.arange(averaged) + 0.5) / averaged - 0.5) * step
+        fine = (t[:, None] + inside).ravel()
+    else:
+        if hand_rate > 1.05 / step:
+            # The hand is sampled faster: its extra samples carry information, so the smooth robot side goes
+            # onto a finer grid.
+            t = t[0] + np.arange(int((t[-1] - t[0]) * hand_rate) + 1) / hand_rate
+            z = signals.resample_uniform(robot.t, z, t, max_gap=1.6 * step, kind="cubic")[1]
+        step = float((t[-1] - t[0]) / (t.size - 1))
+        averaged = averaged_samples(step, bandwidth)
+        z, fine, t = average(z, averaged), t, average(t[:, None], averaged)[:, 0]
+        step *= averaged
+    windowing = Windowing.for_grid(step, window, bandwidth, t.size)
     rows = z[np.isfinite(z).all(axis=1)]
     if rows.shape[0] == 0:
         raise InputError(

@@ -5,11 +5,17 @@ from __future__ import annotations
 import numpy as np
 
 from factorgrasp.problems.grasp_model_check import ModelCheck
-from factorgrasp.typing import FloatArray
+from factorgrasp.problems.grasp_settings import GraspNoise
+from factorgrasp.typing import FloatArray, State
 
 # Rates whose second principal axis carries less than this part of the power turn about one axis only.
 _ONE_AXIS = 0.02
 _ALIGNED = 0.9
+# m/s^2; a fifth of gravity: more than any tilt, bias or bad differentiation of a slow motion.
+_LARGEST_SLOW_FORCE = 2.0
+# Fraction; cheap sensors are off by 3 %.
+_LARGEST_CALIBRATION = 0.15
+_CALIBRATIONS = ("gyro_calibration", "accelerometer_calibration")
 
 
 def rotation_axis(rate_moment: FloatArray) -> tuple[FloatArray, float]:
@@ -90,13 +96,32 @@ def unrelated(correlation: float, rate_moment: FloatArray) -> str:
     )
 
 
-def contradiction(accelerometer_bias: FloatArray, sd: float) -> str:
-    """What it may mean that only an impossible accelerometer bias reconciles the two sides; empty when it is plausible."""
-    size = float(np.linalg.norm(accelerometer_bias))
-    if size < 6.0 * sd or size < 2.0:
-        return ""
+def contradiction(values: State, noise: GraspNoise, residual: float) -> str:
+    """What it may mean that only an impossible sensor reconciles the two sides; empty when the sensor is plausible.
+
+    Parameters
+    ----------
+    values : mapping
+        Unknowns as estimated.
+    noise : GraspNoise
+        With the priors of the sensor's errors.
+    residual : float
+        Disagreement of the slow specific forces that remains, m/s^2 per axis.
+    """
+    bias = float(np.linalg.norm(values.get("accelerometer_bias", np.zeros(3))))
+    size = max(bias, float(np.sqrt(3.0)) * residual)
+    if size > max(6.0 * noise.accelerometer_bias_sd, _LARGEST_SLOW_FORCE):
+        found = (
+            f"The specific forces of the two sides differ by {size:.1f} m/s^2, which no sensor bias explains"
+        )
+    else:
+        scale = max(
+            (float(np.max(np.abs(values[name]))) for name in _CALIBRATIONS if name in values), default=0.0
+        )
+        if scale < _LARGEST_CALIBRATION:
+            return ""
+        found = f"The two sides agree only if the sensor's axes are off by {100.0 * scale:.0f} %"
     return (
-        f"The specific forces of the two sides differ by {size:.1f} m/s^2 that no sensor bias explains: check the sign and "
-        "frame of gravity, that the quaternions are w, x, y, z body-to-world, and that the accelerometer reads m/s^2 with "
-        "gravity in it."
+        f"{found}: check the sign and frame of gravity, that the quaternions are w, x, y, z body-to-world, and that the "
+        "accelerometer reads m/s^2 with gravity in it."
     )

@@ -68,6 +68,7 @@ class HumanDynamics:
                 raise InputError(sensor.name, f"values at the {count} frames of the motion", f"{sensor.values.shape[0]} rows")
         rows = [constraint.row_pattern(motion.tree) for constraint in self.constraints]
         self.system = HumanDynamicsSystem(motion.tree, self.sensors, noise, contacts, use_motion, hard_dynamics, rows)
+        self._values = np.concatenate([sensor.values for sensor in self.sensors], axis=1) if self.sensors else np.zeros((count, 0))
         self._whitening = Whitening(self.system, self.sensors)
         self._arguments = (noise, tuple(contacts), hard_dynamics, use_motion)
 
@@ -98,7 +99,7 @@ class HumanDynamics:
 
     def whitened_frames(self, frames: slice) -> tuple[FloatArray, FloatArray]:
         """Whitened non-zeros (n, nnz) and right-hand sides (n, rows) of some frames."""
-        values = [sensor.values[frames] for sensor in self.sensors]
+        values = self._values[frames]
         entries, rhs = self.system.raw(self.motion.kinematics(frames), values)
         self._whitening.apply(entries, rhs, values, frames)
         return entries, rhs
@@ -109,11 +110,11 @@ class HumanDynamics:
             raise InputError("frame", f"0 to {len(self) - 1}", str(index))
         frames, system, problem = slice(index, index + 1), self.system, self.system.pattern
         k = self.motion.kinematics(frames)
-        values = [sensor.values[frames] for sensor in self.sensors]
+        values = self._values[frames]
         entries, rhs = system.raw(k, values)
         problem.jacobian.matrix.data[:], problem.jacobian.rhs[:] = entries[0], rhs[0]
         for i, rows in enumerate(system.sensors):
-            problem.set_covariance(rows.name, self._whitening.covariance(i, index, values[i][0]))
+            problem.set_covariance(rows.name, self._whitening.covariance(i, index, values[0, system.value_slices[i]]))
         if system.hard_dynamics:
             hard, right = system.hard(k)
             problem.equalities.matrix.data[:], problem.equalities.rhs[:] = hard[0], right[0]

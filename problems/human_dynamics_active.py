@@ -52,7 +52,7 @@ def active_constraints(problem: HumanDynamics, k: LinkKinematics, result: Any) -
     for f in range(result.x.shape[0]):
         if not np.all(np.isfinite(result.x[f])):
             continue
-        one = _one(k, f)
+        one = k.select(slice(f, f + 1))
         for constraint in problem.constraints:
             z = _multiplier(result, f, constraint.name, where[constraint.name])
             if z is None:
@@ -73,9 +73,3 @@ def _multiplier(result: Any, frame: int, name: str, rows: slice) -> FloatArray |
         return np.asarray(z[rows]) if z.size else None
     named = getattr(result, "multipliers", ())
     return np.asarray(named[frame][name]) if named and name in named[frame] else None
-
-
-def _one(k: LinkKinematics, f: int) -> LinkKinematics:
-    parts = {name: getattr(k, name)[f : f + 1] for name in k._fields if name != "subspaces"}
-    S = tuple(None if s is None else (s if s.shape[0] == 1 else s[f : f + 1]) for s in k.subspaces)
-    return LinkKinematics(subspaces=S, **parts)

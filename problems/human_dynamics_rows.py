@@ -12,7 +12,7 @@ from factorgrasp.problems import human_dynamics_sensors as kinds
 from factorgrasp.problems.human_dynamics_names import acceleration_of, joint_acceleration_of, wrench_of, wrench_on
 from factorgrasp.problems.human_dynamics_sensors import Sensor
 from factorgrasp.problems.link_motion import BodyTree, LinkKinematics
-from factorgrasp.problems.link_motion_spatial import rotate, skew
+from factorgrasp.problems.link_motion_spatial import cross, rotate, skew
 from factorgrasp.typing import BoolArray, FloatArray
 
 Make = Callable[[LinkKinematics], FloatArray]
@@ -37,6 +37,8 @@ class SensorRows:
         Functions that give (n, rows, size) per variable that does.
     offset : callable or None
         ``b_Y`` (n, rows).
+    placement : tuple or None
+        Of an accelerometer: index of its link, ``R_s_l`` and ``p_l_s``, from which the offsets of all of them are computed at once.
     """
 
     name: str
@@ -47,6 +49,7 @@ class SensorRows:
     constant: dict[str, FloatArray] = field(default_factory=dict)
     varying: dict[str, Make] = field(default_factory=dict)
     offset: Make | None = None
+    placement: tuple[int, FloatArray, FloatArray] | None = None
 
     def jacobian(self, k: LinkKinematics) -> FloatArray:
         """(1 or n, rows, touched unknowns), the variables side by side in the order of `patterns`."""
@@ -77,7 +80,10 @@ def sensor_rows(tree: BodyTree, sensor: Sensor) -> SensorRows:
     blocks, varying, offset = make(tree, sensor)
     patterns = {name: block != 0.0 for name, block in blocks.items()}
     constant = {name: block for name, block in blocks.items() if name not in varying}
-    return SensorRows(sensor.name, sensor.size, sensor.unit, full, patterns, constant, varying, offset)
+    placement = None
+    if isinstance(sensor, kinds.Accelerometer):
+        placement = (tree.links.index(sensor.link), np.asarray(sensor.R_l_s, dtype=float).T, np.asarray(sensor.p_l_s, dtype=float))
+    return SensorRows(sensor.name, sensor.size, sensor.unit, full, patterns, constant, varying, offset, placement)
 
 
 Made = tuple[dict[str, FloatArray], dict[str, Make], Make | None]
@@ -92,7 +98,7 @@ def _accelerometer(tree: BodyTree, sensor: Sensor) -> Made:
 
     def offset(k: LinkKinematics) -> FloatArray:
         v, w = k.velocity[:, at, :3], k.velocity[:, at, 3:]
-        return np.asarray(np.cross(w, v + np.cross(w, r)) @ back.T)
+        return np.asarray(cross(w, v + cross(w, r)) @ back.T)
 
     return {acceleration_of(sensor.link): block}, {}, offset
 

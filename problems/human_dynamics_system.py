@@ -18,7 +18,7 @@ from factorgrasp.problems.human_dynamics_rows import SensorRows, sensor_rows
 from factorgrasp.problems.human_dynamics_sensors import Sensor
 from factorgrasp.problems.human_dynamics_settings import HumanDynamicsNoise, resolve
 from factorgrasp.problems.link_motion import BodyTree, LinkKinematics
-from factorgrasp.problems.link_motion_spatial import cross_force
+from factorgrasp.problems.link_motion_spatial import cross, cross_force
 from factorgrasp.typing import BoolArray, FloatArray, IntArray
 from factorgrasp.uncertainty import Covariance
 from factorgrasp.variables import Variable
@@ -272,7 +272,7 @@ class HumanDynamicsSystem:
         def put(rows: str, variable: str, value: FloatArray, block: BoolArray | None = None) -> None:
             (dynamics if rows in dynamics.slices else soft).set_block(rows, variable, value if block is None else value[block])
 
-        through, up = [], []
+        through, up, moving = [], [], []
         for j in self.axes:
             joint = tree.joints[j]
             rows = f"propagation through {joint}"
@@ -283,7 +283,7 @@ class HumanDynamicsSystem:
             if S is not None:
                 put(rows, joint_acceleration_of(joint), -S)
             else:
-                writers.append((dynamics.places(rows, joint_acceleration_of(joint)), _minus_subspace(j)))
+                moving.append((j, dynamics.places(rows, joint_acceleration_of(joint))))
         for i, link in enumerate(tree.links):
             rows = f"balance of {link}"
             put(rows, wrench_on(link), -np.eye(6))
@@ -292,6 +292,8 @@ class HumanDynamicsSystem:
         for j, joint in enumerate(tree.joints):
             put(f"balance of {tree.links[tree.children[j]]}", wrench_of(joint), -np.eye(6))
             up.append((j, dynamics.places(f"balance of {tree.links[tree.parents[j]]}", wrench_of(joint))))
+        if moving:
+            writers.append((np.concatenate([at for _, at in moving]), _minus_axes(tree, [j for j, _ in moving])))
         for pairs, kind in ((through, _minus_transform), (up, _transposed_transform)):
             if pairs:
                 writers.append((np.concatenate([at for _, at in pairs]), kind(np.array([j for j, _ in pairs]))))
@@ -326,21 +328,29 @@ class HumanDynamicsSystem:
             self._motion_dofs = np.concatenate([at[j] for j in self._motion_joints] or [np.empty(0, dtype=np.intp)]).astype(np.intp)
         self._sensor_range = _rows(slices, [rows.name for rows in self._sensor_rows])
         indptr = pattern.jacobian.matrix.indptr
-        self._sensor_entries = [
-            slice(int(indptr[slices[r.name].start]), int(indptr[slices[r.name].stop])) for r in self._sensor_rows
-        ]
+        first = self._sensor_range.start
+        self._sensor_entries = slice(int(indptr[first]), int(indptr[self._sensor_range.stop]))
+        self._sensor_of_entry = pattern.jacobian.row_of_entry[self._sensor_entries] - first
+        self.value_slices = tuple(slice(slices[r.name].start - first, slices[r.name].stop - first) for r in self._sensor_rows)
+        placed = [(r.placement, where) for r, where in zip(self._sensor_rows, self.value_slices, strict=True) if r.placement]
+        self._imus = None
+        if placed:
+            self._imus = (
+                np.array([p[0] for p, _ in placed]), np.array([p[1] for p, _ in placed]), np.array([p[2] for p, _ in placed]),
+                np.concatenate([np.arange(where.start, where.stop) for _, where in placed]),
+            )  # fmt: skip
 
     # ---- values -----------------------------------------------------------------------------------------------
 
-    def raw(self, k: LinkKinematics, values: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+    def raw(self, k: LinkKinematics, values: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Non-zeros (n, nnz) and right-hand sides (n, rows) of all terms, not whitened; rows of gaps are zero.
 
         Parameters
         ----------
         k : LinkKinematics
             Of n frames.
-        values : sequence of ndarray
-            (n, k) of every sensor.
+        values : ndarray
+            (n, m) of all sensors side by side.
         """
         count, pattern = k.count, self.pattern
         entries = np.empty((count, self._fixed.size))
@@ -353,14 +363,21 @@ class HumanDynamicsSystem:
         if hasattr(self, "_motion_joints"):
             rhs[:, self._motion_rows] = k.joint_acceleration[:, self._motion_dofs]
             rhs[:, self._motion_link_rows] = k.acceleration[:, self._motion_links].reshape(count, -1)
-        for rows, measured, where in zip(self._sensor_rows, values, self._sensor_entries, strict=True):
-            target = pattern.jacobian.slices[rows.name]
-            right = measured if rows.offset is None else measured - rows.offset(k)
-            gaps = np.isnan(measured)
-            if gaps.any():
-                right = np.where(gaps, 0.0, right)
-                entries[:, where][gaps[:, pattern.jacobian.row_of_entry[where] - target.start]] = 0.0
-            rhs[:, target] = right
+        if not self._sensor_rows:
+            return entries, rhs
+        right = values.copy()
+        if self._imus is not None:
+            links, back, arm, at = self._imus
+            v, w = k.velocity[:, links, :3], k.velocity[:, links, 3:]
+            known = (back @ cross(w, v + cross(w, arm))[..., None])[..., 0]
+            right[:, at] -= known.reshape(count, -1)
+        # One sum finds a NaN several times faster than isnan.
+        if np.isnan(values.sum()):
+            gaps = np.isnan(values)
+            right[gaps] = 0.0
+            part = entries[:, self._sensor_entries]
+            part[gaps[:, self._sensor_of_entry]] = 0.0
+        rhs[:, self._sensor_range] = right
         return entries, rhs
 
     def hard(self, k: LinkKinematics) -> tuple[FloatArray, FloatArray]:
@@ -395,13 +412,15 @@ def _rows(slices: Mapping[str, slice], names: Sequence[str]) -> slice:
     return slice(slices[names[0]].start, slices[names[-1]].stop)
 
 
-def _minus_subspace(j: int) -> Writer:
-    def make(k: LinkKinematics) -> FloatArray:
-        S = k.subspaces[j]
-        assert S is not None
-        return -S.reshape(S.shape[0], -1)
-
-    return make
+def _minus_axes(tree: BodyTree, joints: Sequence[int]) -> Writer:
+    ends = np.cumsum([len(dofs) for dofs in tree.dofs])
+    columns, rows = [], []
+    for j in joints:
+        size = len(tree.dofs[j])
+        columns.append(np.tile(np.arange(ends[j] - size, ends[j]), 6))
+        rows.append(np.repeat(np.arange(6), size))
+    column, row = np.concatenate(columns), np.concatenate(rows)
+    return lambda k: -k.axes[:, column, row]
 
 
 def _minus_transform(joints: IntArray) -> Writer:

@@ -49,8 +49,8 @@ class Whitening:
             return Covariance.diagonal(now)
         return Covariance.blocks(_without(now, np.isnan(gaps)))
 
-    def apply(self, entries: FloatArray, rhs: FloatArray, values: Sequence[FloatArray], frames: slice) -> None:
-        """Whiten raw non-zeros (n, nnz) and right-hand sides (n, rows) in place."""
+    def apply(self, entries: FloatArray, rhs: FloatArray, values: FloatArray, frames: slice) -> None:
+        """Whiten raw non-zeros (n, nnz) and right-hand sides (n, rows) in place, for all sensors' values (n, m) side by side."""
         entries *= self._entry_scale
         rhs *= self._scale
         soft = self._system.pattern.jacobian
@@ -64,7 +64,7 @@ class Whitening:
                 rhs[:, where] *= root
                 continue
             now = C if C.ndim == 2 else C[frames]
-            gaps = np.isnan(values[i])
+            gaps = np.isnan(values[:, self._system.value_slices[i]])
             if gaps.any():
                 now = _without(np.broadcast_to(now, (gaps.shape[0], *now.shape[-2:])), gaps)
             W = np.linalg.inv(np.linalg.cholesky(now))

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -68,7 +68,8 @@ class LinkJoint:
         return len(self.dofs)
 
 
-class LinkKinematics(NamedTuple):
+@dataclass(frozen=True)
+class LinkKinematics:
     """What the equations of motion need of n frames, in the links' own frames; spatial vectors are ``[linear; angular]``.
 
     Attributes
@@ -83,8 +84,10 @@ class LinkKinematics(NamedTuple):
         (n, J, 6, 6) ``X`` from the parent's to the child's frame.
     bias : ndarray
         (n, J, 6) ``c_j``.
-    subspaces : tuple of ndarray or None
-        ``S_j``, (1 or n, 6, n_j).
+    axes : ndarray
+        (n, dofs, 6) columns of all ``S_j``, joint after joint, each in its child's frame.
+    sizes : tuple of int
+        Degrees of freedom of every joint; 0 where the axes are unknown.
     joint_acceleration : ndarray
         (n, dofs).
     joint_centre : ndarray
@@ -97,7 +100,8 @@ class LinkKinematics(NamedTuple):
     acceleration: FloatArray
     transform: FloatArray
     bias: FloatArray
-    subspaces: tuple[FloatArray | None, ...]
+    axes: FloatArray
+    sizes: tuple[int, ...]
     joint_acceleration: FloatArray
     joint_centre: FloatArray
 
@@ -105,6 +109,21 @@ class LinkKinematics(NamedTuple):
     def count(self) -> int:
         """Number of frames."""
         return int(self.R.shape[0])
+
+    @cached_property
+    def subspaces(self) -> tuple[FloatArray | None, ...]:
+        """``S_j``, (n, 6, n_j) by joint; None where the axes are unknown."""
+        ends = np.cumsum(self.sizes)
+        return tuple(
+            np.swapaxes(self.axes[:, end - size : end], 1, 2) if size else None for end, size in zip(ends, self.sizes, strict=True)
+        )
+
+    def select(self, frames: slice) -> LinkKinematics:
+        """Some of the frames."""
+        return LinkKinematics(
+            self.R[frames], self.p[frames], self.velocity[frames], self.acceleration[frames], self.transform[frames], self.bias[frames],
+            self.axes[frames], self.sizes, self.joint_acceleration[frames], self.joint_centre[frames],
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -360,11 +379,16 @@ class LinkMotion:
 
     def kinematics(self, frames: slice = slice(None)) -> LinkKinematics:
         """All of it for some of the frames."""
+        return self._kinematics.select(frames)
+
+    @cached_property
+    def _kinematics(self) -> LinkKinematics:
+        count = len(self)
+        columns = [np.broadcast_to(np.swapaxes(S, 1, 2), (count, S.shape[2], 6)) for S in self.subspaces if S is not None]
+        axes = np.concatenate(columns, axis=1) if columns else np.zeros((count, 0, 6))
         return LinkKinematics(
-            self.R[frames], self.p[frames], self.spatial_velocity[frames], self.proper_acceleration[frames],
-            self.joint_transform[frames], self.joint_bias[frames],
-            tuple(S if S is None or S.shape[0] == 1 else S[frames] for S in self.subspaces),
-            self.qdd[frames], self.joint_centre[frames],
+            self.R, self.p, self.spatial_velocity, self.proper_acceleration, self.joint_transform, self.joint_bias,
+            axes, tuple(joint.size for joint in self.joints), self.qdd, self.joint_centre,
         )  # fmt: skip
 
     # ---- the whole body ---------------------------------------------------------------------------------------

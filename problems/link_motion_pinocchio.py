@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from factorgrasp.errors import InputError
+from factorgrasp.problems import link_motion_kernels
 from factorgrasp.problems.link_motion import GRAVITY, BodyTree, LinkJoint, LinkKinematics, LinkMotion
 from factorgrasp.problems.link_motion_spatial import (
     cross_motion,
@@ -47,6 +48,8 @@ class PinocchioTree:
         Join chains of joints through links without mass and inertia into one joint of up to six degrees of freedom.
     gravity : (3,) array_like
         In the world, m/s^2.
+    compiled : bool, optional
+        False: do without the compiled loop even where numba is installed.
 
     Raises
     ------
@@ -54,7 +57,9 @@ class PinocchioTree:
         For a model without joints, with unnamed joints or links, or with masses and inertias that no body has.
     """
 
-    def __init__(self, model: Any, merge_massless: bool = True, gravity: ArrayLike = GRAVITY) -> None:
+    def __init__(
+        self, model: Any, merge_massless: bool = True, gravity: ArrayLike = GRAVITY, compiled: bool | None = None
+    ) -> None:
         self.model, self.gravity = model, np.asarray(gravity, dtype=float)
         self._data = model.createData()
         if model.njoints < 2:
@@ -98,16 +103,17 @@ class PinocchioTree:
         )
         self._child_of_column = np.concatenate([np.full(c.size, chain.child) for c, chain in zip(self._columns, self._chains, strict=True)])
         self._all_columns: IntArray = np.concatenate(self._columns)
-
-    @property
-    def parents(self) -> IntArray:
-        """(J,) link above every joint."""
-        return np.array([c.parent for c in self._chains], dtype=np.intp)
-
-    @property
-    def children(self) -> IntArray:
-        """(J,) link below every joint."""
-        return np.array([c.child for c in self._chains], dtype=np.intp)
+        self._sizes = tuple(int(c.size) for c in self._columns)
+        self._starts = np.cumsum([0, *self._sizes[:-1]])
+        self.parents: IntArray = np.array([c.parent for c in self._chains], dtype=np.int64)
+        self.children: IntArray = np.array([c.child for c in self._chains], dtype=np.int64)
+        self._compiled = compiled is not False and all(kind.kind in link_motion_kernels.KINDS for kind in self._joint_kinds[1:] if kind)
+        self._constants = self._kernel_constants()
+        self._quaternions = [
+            int(model.idx_qs[i]) + (3 if self._kind(i).kind == "freeflyer" else 0)
+            for i in range(1, model.njoints)
+            if self._kind(i).kind in ("spherical", "freeflyer")
+        ]
 
     @property
     def tree(self) -> BodyTree:
@@ -138,12 +144,15 @@ class PinocchioTree:
                 self.joint_names, self._chains, self._dofs, k.subspaces, self._fixed_subspaces, strict=True
             )
         )
-        return LinkMotion(
+        motion = LinkMotion(
             t=np.atleast_1d(np.asarray(t, dtype=float)), links=self.links, mass=self.mass, com=self.com, inertia=self.inertia,
             R=k.R, p=k.p, velocity=rotate(k.R, linear), angular_velocity=rotate(k.R, angular), acceleration=a,
             angular_acceleration=rotate(k.R, k.acceleration[..., 3:]), joints=joints, joint_centre=k.joint_centre,
             joint_acceleration=k.joint_acceleration, base="floating" if self.floating else "fixed", gravity=self.gravity,
         )  # fmt: skip
+        # Known already: no need to derive it from the world's quantities again.
+        motion.__dict__["_kinematics"] = k
+        return motion
 
     def kinematics(self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike) -> LinkKinematics:
         """The same as body-frame quantities, which is all that the equations of motion need."""
@@ -151,26 +160,51 @@ class PinocchioTree:
         for name, value, width in (("q", positions, self.model.nq), ("qd", v, self.model.nv), ("qdd", a, self.model.nv)):
             if value.ndim != 2 or value.shape[1] != width or value.shape[0] != positions.shape[0]:
                 raise InputError(name, f"shape ({positions.shape[0]}, {width})", str(value.shape))
+        kernel = link_motion_kernels.load() if self._compiled else None
+        if kernel is not None:
+            return self._by_kernel(kernel, positions, v, a)
         by_frame = positions.shape[0] <= FEW_FRAMES and np.all(np.isfinite(positions))
-        R, p, vel, acc, S_all = (self._by_frame if by_frame else self._vectorised)(positions, v, a)
+        R, p, vel, acc, axes = (self._by_frame if by_frame else self._vectorised)(positions, v, a)
         acc[..., :3] -= rotate_back(R, np.broadcast_to(self.gravity, p.shape))
         up, down = self.parents, self.children
         R_c_p = np.swapaxes(R[:, down], -1, -2) @ R[:, up]
         X = motion_transform(R_c_p, rotate_back(R[:, up], p[:, down] - p[:, up]))
         qdd_ours = a[:, self._all_columns]
         bias = acc[:, down] - (X @ acc[:, up, :, None])[..., 0]
-        subspaces: list[FloatArray | None] = []
-        first = 0
-        product = S_all * qdd_ours[:, :, None]
-        for j, fixed in enumerate(self._fixed_subspaces):
-            size = self._columns[j].size
-            part = slice(first, first + size)
-            subspaces.append(np.swapaxes(S_all[:, part], 1, 2) if fixed is None else fixed[None])
-            bias[:, j] -= product[:, part].sum(axis=1)
-            first += size
-        return LinkKinematics(R, p, vel, acc, X, bias, tuple(subspaces), qdd_ours, p[:, down])
+        bias -= np.add.reduceat(axes * qdd_ours[:, :, None], self._starts, axis=1)
+        return LinkKinematics(R, p, vel, acc, X, bias, axes, self._sizes, qdd_ours, p[:, down])
+
+    def _by_kernel(self, kernel: Any, q: FloatArray, v: FloatArray, a: FloatArray) -> LinkKinematics:
+        count, links, joints, dofs = q.shape[0], len(self._kept), len(self._chains), self._all_columns.size
+        for at in self._quaternions:
+            _check_quaternions(q[:, at : at + 4])
+        R, p, vel, acc = np.empty((count, links, 3, 3)), np.empty((count, links, 3)), np.empty((count, links, 6)), np.empty((count, links, 6))
+        X, bias, axes = np.empty((count, joints, 6, 6)), np.empty((count, joints, 6)), np.empty((count, dofs, 6))
+        kernel(*self._constants[:7], q, v, a, *self._constants[7:], R, p, vel, acc, X, bias, axes)
+        return LinkKinematics(R, p, vel, acc, X, bias, axes, self._sizes, a[:, self._all_columns], p[:, self._constants[10]])
 
     # ---- internals --------------------------------------------------------------------------------------------
+
+    def _kernel_constants(self) -> tuple[Any, ...]:
+        model, kinds = self.model, link_motion_kernels.KINDS
+        number = model.njoints
+        codes, axes = np.zeros(number, dtype=np.int64), np.zeros((number, 3))
+        for i in range(1, number):
+            one = self._kind(i)
+            codes[i] = kinds.get(one.kind, 0)
+            axes[i] = 0.0 if one.axis is None else one.axis
+        R = np.array([np.asarray(model.jointPlacements[i].rotation) for i in range(number)])
+        p = np.array([np.asarray(model.jointPlacements[i].translation) for i in range(number)])
+        columns = [(m, part, c) for c, chain in enumerate(self._chains) for m in chain.members for part in range(int(model.nvs[m]))]
+        joint, part, owner = (np.array(column, dtype=np.int64) for column in zip(*columns, strict=True))
+
+        def whole(values: Any) -> IntArray:
+            return np.array([int(values[i]) for i in range(number)], dtype=np.int64)
+
+        return (
+            codes, axes, R, p, whole(model.parents), whole(model.idx_qs), whole(model.idx_vs), self.gravity,
+            np.array(self._kept, dtype=np.int64), self.parents, self.children, joint, part, owner, self._all_columns.astype(np.int64),
+        )  # fmt: skip
 
     def _kind(self, joint: int) -> _JointKind:
         kind = self._joint_kinds[joint]
@@ -257,32 +291,32 @@ class _JointKind:
         joint = model.joints[index]
         self._joint, self._name = joint, joint.shortname()
         self.nq, self.nv = int(joint.nq), int(joint.nv)
-        self._axis: FloatArray | None = None
-        self._kind = "other"
+        self.axis: FloatArray | None = None
+        self.kind = "other"
         name = self._name.removeprefix("JointModel")
         if name in ("RX", "RY", "RZ", "PX", "PY", "PZ", "RUBX", "RUBY", "RUBZ"):
-            self._axis = np.eye(3)["XYZ".index(name[-1])]
-            self._kind = {"RU": "unbounded", "PX": "prismatic", "PY": "prismatic", "PZ": "prismatic"}.get(name[:2], "revolute")
+            self.axis = np.eye(3)["XYZ".index(name[-1])]
+            self.kind = {"RU": "unbounded", "PX": "prismatic", "PY": "prismatic", "PZ": "prismatic"}.get(name[:2], "revolute")
         elif name in ("RevoluteUnaligned", "RevoluteUnboundedUnaligned", "PrismaticUnaligned"):
             # Through the data: the bindings offer the axis of the generic joint under no name.
             data = joint.createData()
             joint.calc(data, _neutral(model), np.zeros(model.nv))
             column = np.asarray(data.S).ravel()
             prismatic = name == "PrismaticUnaligned"
-            self._axis = column[:3] if prismatic else column[3:]
-            self._kind = "prismatic" if prismatic else ("unbounded" if "Unbounded" in name else "revolute")
+            self.axis = column[:3] if prismatic else column[3:]
+            self.kind = "prismatic" if prismatic else ("unbounded" if "Unbounded" in name else "revolute")
         elif name in ("Spherical", "FreeFlyer", "Translation"):
-            self._kind = name.lower()
+            self.kind = name.lower()
         self.subspace = self._constant_subspace()
 
     def _constant_subspace(self) -> FloatArray | None:
         zero, one = np.zeros((3, 3)), np.eye(3)
-        if self._axis is not None:
-            parts = (self._axis, np.zeros(3)) if self._kind == "prismatic" else (np.zeros(3), self._axis)
+        if self.axis is not None:
+            parts = (self.axis, np.zeros(3)) if self.kind == "prismatic" else (np.zeros(3), self.axis)
             return np.concatenate(parts)[:, None]
         return {
             "spherical": np.vstack([zero, one]), "translation": np.vstack([one, zero]), "freeflyer": np.eye(6)
-        }.get(self._kind)  # fmt: skip
+        }.get(self.kind)  # fmt: skip
 
     def motion(
         self, q: FloatArray, v: FloatArray, whole_q: FloatArray, whole_v: FloatArray
@@ -293,16 +327,16 @@ class _JointKind:
         S = None if self.subspace is None else self.subspace[None]
         if S is None:
             return self._frame_by_frame(whole_q, whole_v)
-        if self._axis is not None:
-            if self._kind == "prismatic":
-                p = q * self._axis
+        if self.axis is not None:
+            if self.kind == "prismatic":
+                p = q * self.axis
             else:
-                cosine, sine = (np.cos(q), np.sin(q)) if self._kind == "revolute" else (q[:, :1], q[:, 1:])
-                K = skew(self._axis)
+                cosine, sine = (np.cos(q), np.sin(q)) if self.kind == "revolute" else (q[:, :1], q[:, 1:])
+                K = skew(self.axis)
                 R = np.eye(3) + sine[:, :, None] * K + (1.0 - cosine)[:, :, None] * (K @ K)
-        elif self._kind == "spherical":
+        elif self.kind == "spherical":
             R = _from_xyzw(q)
-        elif self._kind == "freeflyer":
+        elif self.kind == "freeflyer":
             R, p = _from_xyzw(q[:, 3:]), q[:, :3]
         else:
             p = q
@@ -328,15 +362,20 @@ def _into(R: FloatArray, p: FloatArray, m: FloatArray) -> FloatArray:
 
 def _from_xyzw(q: FloatArray) -> FloatArray:
     """Rotations of unit quaternions ``[x, y, z, w]`` (n, 4)."""
-    norm = np.linalg.norm(q, axis=1)
-    bad = np.isfinite(norm) & (np.abs(norm - 1.0) > 1e-3)
-    if bad.any():
-        frame = int(np.flatnonzero(bad)[0])
-        raise InputError("quaternion in q", "unit length, [x, y, z, w]", f"length {norm[frame]:.4g} in frame {frame}")
+    norm = _check_quaternions(q)
     e = q[:, :3] / norm[:, None]
     w = (q[:, 3] / norm)[:, None, None]
     K = skew(e)
     return np.asarray(np.eye(3) + 2.0 * w * K + 2.0 * (K @ K))
+
+
+def _check_quaternions(q: FloatArray) -> FloatArray:
+    norm = np.sqrt(np.einsum("ni,ni->n", q, q))
+    bad = np.isfinite(norm) & (np.abs(norm - 1.0) > 1e-3)
+    if bad.any():
+        frame = int(np.flatnonzero(bad)[0])
+        raise InputError("quaternion in q", "unit length, [x, y, z, w]", f"length {norm[frame]:.4g} in frame {frame}")
+    return np.asarray(norm)
 
 
 def _neutral(model: Any) -> FloatArray:

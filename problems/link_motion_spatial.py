@@ -15,6 +15,17 @@ def skew(v: FloatArray) -> FloatArray:
     return out
 
 
+def cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """``a x b`` over the last axis; a few times faster than numpy's for few vectors."""
+    out = np.empty(np.broadcast_shapes(a.shape, b.shape))
+    a0, a1, a2 = a[..., 0], a[..., 1], a[..., 2]
+    b0, b1, b2 = b[..., 0], b[..., 1], b[..., 2]
+    out[..., 0] = a1 * b2 - a2 * b1
+    out[..., 1] = a2 * b0 - a0 * b2
+    out[..., 2] = a0 * b1 - a1 * b0
+    return out
+
+
 def motion_transform(R_b_a: FloatArray, p_a_b: FloatArray) -> FloatArray:
     """``X`` that turns a motion vector in frame a into frame b: ``[[R, -R S(p)], [0, R]]``.
 
@@ -67,11 +78,11 @@ def cross_force(v: FloatArray, f: FloatArray) -> FloatArray:
     """``v x* f = [w x f_lin; v_lin x f_lin + w x f_ang]`` for (..., 6)."""
     linear, angular = v[..., :3], v[..., 3:]
     force, moment = f[..., :3], f[..., 3:]
-    return np.concatenate([np.cross(angular, force), np.cross(linear, force) + np.cross(angular, moment)], axis=-1)
+    return np.concatenate([cross(angular, force), cross(linear, force) + cross(angular, moment)], axis=-1)
 
 
 def cross_motion(v: FloatArray, m: FloatArray) -> FloatArray:
     """``v x m = [w x m_lin + v_lin x m_ang; w x m_ang]`` for (..., 6)."""
     linear, angular = v[..., :3], v[..., 3:]
     first, second = m[..., :3], m[..., 3:]
-    return np.concatenate([np.cross(angular, first) + np.cross(linear, second), np.cross(angular, second)], axis=-1)
+    return np.concatenate([cross(angular, first) + cross(linear, second), cross(angular, second)], axis=-1)

@@ -244,10 +244,11 @@ class FixedLagSmoother:
         for factor in native:
             graph.push_back(factor)
         fresh = [self._record(factor, at) for factor in (*quadratics, *(record.factor for record in stale))]
-        for record, hessian in fresh:
-            graph.push_back(gtsam.LinearContainerFactor(hessian, record.point))
-        # The wrapper hands out a reference to the factors, which the update changes: copy.
-        before = gtsam.NonlinearFactorGraph(self._smoother.getFactors()), self._smoother.timestamps()
+        for _, hessian in fresh:
+            graph.push_back(gtsam.LinearContainerFactor(hessian, at))
+        # The wrapper hands out references to what the update changes: copy.
+        factors = gtsam.NonlinearFactorGraph(self._smoother.getFactors())
+        before = factors, gtsam.Values(self._smoother.getLinearizationPoint()), self._smoother.timestamps()
         try:
             result = self._smoother.update(graph, new, dict(stamps), [record.slot for record in stale])
         except RuntimeError as error:
@@ -264,21 +265,27 @@ class FixedLagSmoother:
         self._values = self._smoother.calculateEstimate()
         return True
 
-    def _restore(self, factors: Any, stamps: Mapping[int, float]) -> None:
+    def _restore(self, factors: Any, point: Any, stamps: Mapping[int, float]) -> None:
         """A smoother as it was before an update that failed half-way."""
         import gtsam
 
         graph, place = gtsam.NonlinearFactorGraph(), {}
         for slot in range(factors.size()):
-            if factors.at(slot) is not None:
-                place[slot] = graph.size()
-                graph.push_back(factors.at(slot))
+            factor = factors.at(slot)
+            if factor is None:
+                continue
+            if isinstance(factor, gtsam.LinearContainerFactor):
+                # What gtsam marginalised holds only at its own linearisation point, which it does not name.
+                factor = gtsam.LinearContainerFactor(factor.linearize(point), point)
+            place[slot] = graph.size()
+            graph.push_back(factor)
         self._smoother = self._empty()
         if graph.size():
-            self._smoother.update(graph, self._values, dict(stamps))
+            self._smoother.update(graph, point, dict(stamps))
             slots = self._smoother.getISAM2Result().getNewFactorsIndices()
             for record in self._records:
                 record.slot = slots[place[record.slot]]
+            self._values = self._smoother.calculateEstimate()
 
     def _record(self, factor: QuadraticFactor, at: Any) -> tuple[_Record, Any]:
         hessian = factor.hessian(at)

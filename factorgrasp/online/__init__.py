@@ -1,10 +1,31 @@
-"""Streaming estimators: the same terms as the batch problems, bounded memory and latency."""
+"""Streaming estimators: the terms of the problems, one frame at a time, in bounded memory and time.
+
+Names load when first used, so that one estimator does not pay for the others.
+"""
 
 from __future__ import annotations
 
-from factorgrasp.online.change_watch import DetectorSettings
-from factorgrasp.online.estimate import OnlineGraspEstimate, StreamCounts
-from factorgrasp.online.events import GraspEvent
-from factorgrasp.online.grasp import OnlineGraspPose
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from factorgrasp.online.change_watch import DetectorSettings
+    from factorgrasp.online.estimate import OnlineGraspEstimate, StreamCounts
+    from factorgrasp.online.events import GraspEvent
+    from factorgrasp.online.grasp import OnlineGraspPose
+
+_WHERE = {
+    "DetectorSettings": "change_watch",
+    "GraspEvent": "events",
+    "OnlineGraspEstimate": "estimate",
+    "OnlineGraspPose": "grasp",
+    "StreamCounts": "estimate",
+}
 
 __all__ = ["DetectorSettings", "GraspEvent", "OnlineGraspEstimate", "OnlineGraspPose", "StreamCounts"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _WHERE:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_WHERE[name]}"), name)

@@ -9,7 +9,7 @@ import numpy as np
 
 from factorgrasp.online.coupled_rows import ACCELEROMETER, GYRO, shift_hand
 from factorgrasp.online.fitter import GraspFitter, columns_of
-from factorgrasp.online.jump_detector import GRASP, STARTS, Jump, JumpDetector, Segments, explain
+from factorgrasp.online.jump_detector import GRASP, GUARD, REACH, STARTS, Jump, JumpDetector, Segments, explain
 from factorgrasp.online.moment_solver import Moment, batched_normals, local, retract
 from factorgrasp.online.row_history import RowHistory
 from factorgrasp.problems.grasp_model import GYRO_WIDTH, GraspModel
@@ -17,7 +17,12 @@ from factorgrasp.typing import FloatArray, State
 
 # A drift is told from a jump by this much evidence, and lasts at least so many segments.
 _SLIP_EVIDENCE = 3.0
-_SHORTEST_SLIP = 8
+_SLIP_SHARE = 0.05
+_SHORTEST_SLIP = 20
+# Starts are all tried at every third segment, the newest ones at each.
+_FULL_TEST, _QUICK_STARTS = 3, 4
+# Soon after a change smaller ones count, by this factor.
+_ALERT = 0.3
 # A reference this far (tangent step) from the estimate before makes its snapshots worthless.
 _FAR = 0.2
 # Give of a firm hold, as part of the smallest change that is reported.
@@ -45,6 +50,19 @@ class DetectorSettings:
         """Variances (6,) of the slight changes that are no event, rad^2 and m^2."""
         return np.repeat([(_GIVE * self.smallest_angle) ** 2, (_GIVE * self.smallest_distance) ** 2], 3)
 
+    def reports(self, step: FloatArray) -> bool:
+        """Whether a change by `step` (6,) is large enough."""
+        angle, distance = np.linalg.norm(step[:3]), np.linalg.norm(step[3:])
+        return bool(angle >= self.smallest_angle or distance >= self.smallest_distance)
+
+    def alerted(self) -> DetectorSettings:
+        """After a change: what may be the rest of it counts although it is smaller."""
+        return replace(
+            self,
+            smallest_angle=_ALERT * self.smallest_angle,
+            smallest_distance=_ALERT * self.smallest_distance,
+        )
+
 
 @dataclass(frozen=True)
 class Change:
@@ -61,6 +79,8 @@ class Change:
     before_covariance : (n, n) ndarray
         Estimate from data before the change.
     jump : Jump
+    large : bool
+        Above the smallest change that is reported when the grasp has not just changed.
     """
 
     kind: Literal["regrasp", "slip"]
@@ -69,6 +89,7 @@ class Change:
     before: State
     before_covariance: FloatArray
     jump: Jump
+    large: bool
 
 
 class ChangeWatch:
@@ -86,12 +107,13 @@ class ChangeWatch:
 
     def __init__(self, fitter: GraspFitter, segment: int, columns: int, settings: DetectorSettings) -> None:
         self._fitter, self._segment, self._settings = fitter, segment, settings
-        self._coefficients = RowHistory(STARTS[-1] + 1, fitter.short.bank.windowing.bins * 2 * columns)
+        self._coefficients = RowHistory(REACH, fitter.short.bank.windowing.bins * 2 * columns)
         width = fitter.long.bank.width
-        self._moments = RowHistory(STARTS[-1] + 2, 2 * (GYRO_WIDTH**2 + width**2))
+        self._moments = RowHistory(REACH, 2 * (GYRO_WIDTH**2 + width**2))
         self._reference: State | None = None
         self._model: GraspModel = fitter.model
         self._detector = JumpDetector(fitter.model.size)
+        self._turn = 0
 
     def add(self, rows: RowHistory) -> None:
         """A segment is complete: the newest window of two segment lengths."""
@@ -108,7 +130,7 @@ class ChangeWatch:
         if self._reference is None:
             self.refer()
         assert self._reference is not None
-        mean, covariance = local(self._model, self._reference, fit.state), self._loose(self._fitter.covariance())
+        mean, covariance = local(self._model, self._reference, fit.state), self._fitter.covariance()
         self._detector.add_snapshot(time, mean, covariance)
         level = self._fitter.level
         assert level is not None
@@ -162,55 +184,64 @@ class ChangeWatch:
         self._moments.run = 0
         self._reference = None
 
-    def find(self, rows: RowHistory) -> Change | None:
-        """A change of the grasp in the newest segments."""
-        jumps = self._detector.jumps()
-        if max((jump.log_bayes_factor for jump in jumps), default=0.0) < self._settings.log_bayes_factor:
-            return None
-        best = self._confirmed(max(jumps, key=lambda jump: jump.evidence))
-        if best is None:
-            return None
-        _, state, covariance = self._before(best)
-        drift = max(self._detector.ramps(), key=lambda jump: jump.evidence)
-        if drift.segments >= _SHORTEST_SLIP and drift.evidence > best.evidence + _SLIP_EVIDENCE:
-            time, state, covariance = self._before(drift)
-            kept = max(best.segments // 2, 1) * self._segment
-            return Change("slip", time, kept, state, covariance, drift)
-        kept = self._since(rows, best, state)
-        return Change("regrasp", float(rows.last_times(kept + 1)[0]), kept, state, covariance, best)
+    def find(self, rows: RowHistory, alert: bool) -> Change | None:
+        """A change of the grasp in the newest segments.
 
-    def _confirmed(self, jump: Jump) -> Jump | None:
+        Parameters
+        ----------
+        rows : RowHistory
+        alert : bool
+            The grasp has just changed: smaller changes count, too, since they may be the rest of that one.
+        """
+        settings = self._settings.alerted() if alert else self._settings
+        self._turn = (self._turn + 1) % _FULL_TEST
+        starts = self._detector.starts(STARTS if self._turn == 0 else STARTS[:_QUICK_STARTS])
+        if not starts:
+            return None
+        jumps = self._detector.jumps(starts, settings.give)
+        if max(jump.log_bayes_factor for jump in jumps) < settings.log_bayes_factor:
+            return None
+        best, drift = self._detector.shapes(settings.give)
+        margin = max(_SLIP_EVIDENCE, _SLIP_SHARE * best.evidence)
+        slips = drift.segments >= _SHORTEST_SLIP and drift.evidence > best.evidence + margin
+        sure = self._confirmed(best, settings)
+        if sure is None:
+            return None
+        if slips:
+            time, state, covariance = self._before(drift)
+            return Change("slip", time, max(best.segments // 2, 1) * self._segment, state, covariance, drift, self._settings.reports(drift.step))
+        _, state, covariance = self._before(best)
+        kept = self._since(rows, sure, state)
+        return Change("regrasp", float(rows.last_times(kept + 1)[0]), kept, state, covariance, sure, self._settings.reports(sure.step))
+
+    def _confirmed(self, jump: Jump, settings: DetectorSettings) -> Jump | None:
         """The jump, if it is large and convinces even where errors of the hand's sensors could explain the residuals instead."""
-        angle, distance = np.linalg.norm(jump.step[:3]), np.linalg.norm(jump.step[3:])
-        if angle < self._settings.smallest_angle and distance < self._settings.smallest_distance:
+        if not settings.reports(jump.step):
             return None
         _, state, _ = self._before(jump)
-        known = Moment.from_row(self._moments.last(jump.segments)[0], self._fitter.long.bank.width)
+        known = Moment.from_row(self._moments.last(jump.segments + GUARD)[0], self._fitter.long.bank.width)
         fit = self._fitter.with_sensor_errors(state, known)
-        normals = batched_normals(fit.model, fit.state, self._segment_moments(jump.segments), self._fitter.short.window_noise)
+        count = jump.segments
+        normals = batched_normals(
+            fit.model, fit.state, self._segment_moments(count), self._fitter.short.window_noise
+        )
         cost, gradient, information = (part.sum(axis=0) for part in normals)
+        covariance = fit.covariance()
+        covariance[range(GRASP), range(GRASP)] += settings.give
         data = Segments(
-            [jump.segments],
+            [count],
             np.array([cost]),
-            np.array([jump.segments * self._fitter.short.residuals]),
+            np.array([count * self._fitter.short.residuals]),
             np.zeros((1, fit.model.size)),
-            self._loose(fit.covariance())[None],
+            covariance[None],
             gradient[None],
             information[None],
             gradient[None, :GRASP],
             information[None, :, :GRASP],
             information[None, :GRASP, :GRASP],
         )
-        surer = explain(data, 0.0, 0.0)[0]
-        if surer.log_bayes_factor < self._settings.log_bayes_factor:
-            return None
-        return replace(surer, evidence=jump.evidence)
-
-    def _loose(self, covariance: FloatArray) -> FloatArray:
-        """A covariance (n, n) with the give of the hold added."""
-        out = covariance.copy()
-        out[range(GRASP), range(GRASP)] += self._settings.give
-        return out
+        surer = explain(data, np.zeros(1), np.zeros(1))[0]
+        return surer if surer.log_bayes_factor >= settings.log_bayes_factor else None
 
     def _segment_moments(self, count: int) -> tuple[FloatArray, FloatArray]:
         short = self._fitter.short
@@ -234,7 +265,7 @@ class ChangeWatch:
     def _since(self, rows: RowHistory, jump: Jump, before: State) -> int:
         """How many of the newest rows fit the grasp after better than the one before."""
         after = retract(self._model, before, np.concatenate([jump.step, np.zeros(self._model.size - GRASP)]))
-        first = (jump.segments + 2) * self._segment
+        first = (jump.segments + GUARD + 2) * self._segment
         z = rows.last(min(first, rows.kept))
         gain = np.zeros(z.shape[0])
         for part, L_before, L_after in zip((GYRO, ACCELEROMETER), self._model.matrices(before), self._model.matrices(after), strict=True):
@@ -243,4 +274,4 @@ class ChangeWatch:
             gain += (e_before - e_after) / max(float(np.mean(e_before[: self._segment])), 1e-300)
         # The best split: rows after it speak for the new grasp, rows before it for the old one.
         total = np.cumsum(gain[::-1])
-        return int(np.clip(np.argmax(total) + 1, 1, (jump.segments + 1) * self._segment))
+        return int(np.clip(np.argmax(total) + 1, jump.segments * self._segment, (jump.segments + GUARD) * self._segment))

@@ -11,11 +11,11 @@ from factorgrasp.online.coupled_rows import Coupler, HandReader
 from factorgrasp.online.robot_feed import Differentiator, ImuRows, MotionRows, PoseRows, RobotFeed, RobotKind
 from factorgrasp.online.sample_buffer import SampleBuffer
 from factorgrasp.online.stream_pieces import GapCutter
+from factorgrasp.problems.grasp_averaging import averaged_samples
 from factorgrasp.problems.grasp_kinematics import RobotNoise, differentiator, gap_limit, robot_kinematics
 from factorgrasp.problems.grasp_recording import (
     ClockSearch,
     HandSignals,
-    averaged_samples,
     find_clock,
     tilt_axes,
 )

@@ -15,8 +15,9 @@ from factorgrasp.errors import InputError
 from factorgrasp.online.robot_feed import ROBOT_WIDTH
 from factorgrasp.online.sample_buffer import SampleBuffer
 from factorgrasp.online.stream_pieces import Piece
+from factorgrasp.problems.grasp_averaging import average
 from factorgrasp.problems.grasp_model import ACCELEROMETER_WIDTH, GYRO_WIDTH, TILTED_WIDTH
-from factorgrasp.problems.grasp_recording import average, shifted_rows
+from factorgrasp.problems.grasp_recording import shifted_rows
 from factorgrasp.typing import FloatArray
 
 GYRO = slice(0, GYRO_WIDTH)

@@ -1,6 +1,6 @@
 """Has the grasp changed? Log Bayes factors of a change in (R, r) at several times back and of several sizes (mathematics 2.3).
 
-Second moments of short segments (0.1 s apart) say what the newest seconds ask for; snapshots of the running estimate say what was known before each of
+Second moments of short segments say what the newest seconds ask for; snapshots of the running estimate say what was known before each of
 them. With ``g, H`` the gradient and Gauss-Newton matrix of the segments since a start, ``P`` the covariance of the snapshot taken at that start and
 ``u = g + H mu`` the gradient at its mean, a jump ``d ~ N(0, D)`` of the grasp shows through
 
@@ -13,6 +13,7 @@ known: the residual power of the very segments under test decides, through the S
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -22,8 +23,11 @@ from factorgrasp.online.row_history import RowHistory
 from factorgrasp.typing import FloatArray
 
 GRASP = 6
-# Segments back at which a change may have begun.
-STARTS = (1, 2, 3, 4, 6, 8, 11, 15, 20, 27, 36, 50)
+# Segments since a change at which it is looked for; all of them begin after it.
+STARTS = (1, 2, 3, 4, 6, 8, 12, 17, 24, 34, 48, 68, 96, 125)
+# Windows overlap by half: two of them may straddle a change, and belong to neither side.
+GUARD = 2
+REACH = STARTS[-1] + GUARD
 # Sizes of a change, as multiples of 10 deg and 70 mm.
 _SCALES = np.array([3.0, 1.0, 0.3, 0.1, 0.03])
 _UNIT = np.repeat([np.deg2rad(10.0), 0.07], 3)
@@ -38,7 +42,7 @@ class Jump:
     Attributes
     ----------
     segments : int
-        How many segments back it began.
+        How many segments lie wholly after it.
     log_bayes_factor : float
         Against no change, with the noise level of the segments since the start: it must convince, also where the noise has just become louder.
     evidence : float
@@ -66,8 +70,8 @@ class JumpDetector:
 
     def __init__(self, size: int) -> None:
         self.size = size
-        self._segments = RowHistory(STARTS[-1] + 1, 2 + size + size**2)
-        self._snapshots = RowHistory(STARTS[-1] + 2, size + size**2)
+        self._segments = RowHistory(REACH, 2 + size + size**2)
+        self._snapshots = RowHistory(REACH, size + size**2)
 
     def add_segments(
         self, times: FloatArray, costs: FloatArray, gradients: FloatArray, informations: FloatArray, residuals: float
@@ -107,64 +111,74 @@ class JumpDetector:
             out.add_snapshot(float(time), mean, covariance)
         return out
 
-    @property
-    def starts(self) -> list[int]:
-        """Starts (segments back) for which there is a snapshot."""
-        # The newest snapshot was taken after the segment before the newest; one `k` segments back is the k-th newest.
-        known = min(self._segments.kept, self._snapshots.kept)
-        return [k for k in STARTS if k <= known]
+    def starts(self, candidates: Sequence[int] = STARTS) -> list[int]:
+        """Starts for which there is a snapshot."""
+        # The newest snapshot was taken after the segment before the newest.
+        known = min(self._segments.kept, self._snapshots.kept) - GUARD
+        return [k for k in candidates if k <= known]
 
     def snapshot(self, segments: int) -> tuple[float, FloatArray, FloatArray]:
-        """Time, mean (n,) and covariance (n, n) of the estimate before the newest `segments`."""
-        row = self._snapshots.last(segments)[0]
-        return float(self._snapshots.last_times(segments)[0]), row[: self.size], row[self.size :].reshape(self.size, self.size)
+        """Time, mean (n,) and covariance (n, n) of the estimate before a change that the newest `segments` follow."""
+        back = segments + GUARD
+        row = self._snapshots.last(back)[0]
+        return float(self._snapshots.last_times(back)[0]), row[: self.size], row[self.size :].reshape(self.size, self.size)
 
-    def jumps(self) -> list[Jump]:
-        """The best jump for every start, newest start first."""
-        starts, n = self.starts, self.size
-        if not starts:
-            return []
+    def jumps(self, starts: list[int], give: FloatArray) -> list[Jump]:
+        """The best jump for every start, beyond changes with variances `give` (6,) that are none."""
+        n = self.size
         rows = self._segments.last(starts[-1])[::-1]
         sums = np.cumsum(np.add.reduceat(rows, [0, *starts[:-1]], axis=0), axis=0)
         cost, count, g, H = sums[:, 0], sums[:, 1], sums[:, 2 : 2 + n], sums[:, 2 + n :].reshape(-1, n, n)
-        mean, P = self._known(starts)
-        data = Segments(starts, cost, count, mean, P, g, H, g[:, :GRASP], H[:, :, :GRASP], H[:, :GRASP, :GRASP])
-        return explain(data, *self._whole())
+        cross, own = H[:, :, :GRASP], H[:, :GRASP, :GRASP]
+        data = Segments(starts, cost, count, *self._known(starts, give), g, H, g[:, :GRASP], cross, own)
+        return explain(data, *self._older(starts))
 
-    def ramps(self) -> list[Jump]:
-        """The best steady drift since every start; `step` is how far it has come."""
-        starts, n = self.starts, self.size
-        if not starts:
-            return []
-        rows = self._segments.last(starts[-1])[::-1]
-        parts: list[list[FloatArray]] = []
-        for k in starts:
-            u = 1.0 - (np.arange(k) + 0.5) / k
-            total = rows[:k].sum(axis=0)
-            g, H = rows[:k, 2 : 2 + n], rows[:k, 2 + n :].reshape(-1, n, n)
-            parts.append(
-                [
-                    total[0],
-                    total[1],
-                    total[2 : 2 + n],
-                    total[2 + n :].reshape(n, n),
-                    u @ g[:, :GRASP],
-                    np.tensordot(u, H[:, :, :GRASP], 1),
-                    np.tensordot(u**2, H[:, :GRASP, :GRASP], 1),
-                ]
-            )
-        cost, count, g_all, H_all, g_d, cross, own = (np.array(part) for part in zip(*parts, strict=True))
-        data = Segments(starts, cost, count, *self._known(starts), g_all, H_all, g_d, cross, own)
-        return explain(data, *self._whole())
+    def shapes(self, give: FloatArray) -> tuple[Jump, Jump]:
+        """The best jump and the best steady drift on the same segments, all that are held; `step` is how far they have come.
 
-    def _known(self, starts: list[int]) -> tuple[FloatArray, FloatArray]:
-        rows = self._snapshots.last(starts[-1])[::-1][np.array(starts) - 1]
-        return rows[:, : self.size], rows[:, self.size :].reshape(-1, self.size, self.size)
+        A jump half way in a window counts as a part of it; the windows beside it are shared out 3 to 1.
+        """
+        n, count = self.size, self.starts(range(1, STARTS[-1] + 1))[-1]
+        rows = self._segments.last(count + GUARD)[::-1]
+        g, H = rows[:, 2 : 2 + n], rows[:, 2 + n :].reshape(-1, n, n)
+        back = np.arange(count + GUARD)
+        k = np.arange(1, count + 1)[:, None]
+        jumps = np.interp(back - k, [-1.0, 0.0, 1.0, 2.0], [1.0, 0.75, 0.25, 0.0])
+        u = np.concatenate([jumps, np.maximum(1.0 - (back + 0.5) / k, 0.0)])
+        mean, P = self._known([count], give)
+        S = u.shape[0]
 
-    def _whole(self) -> tuple[float, float]:
-        """Cost and number of residuals of all segments."""
-        rows = self._segments.last(self._segments.kept)
-        return float(rows[:, 0].sum()), float(rows[:, 1].sum())
+        def same(x: FloatArray) -> FloatArray:
+            return np.broadcast_to(x, (S, *x.shape))
+
+        data = Segments(
+            [*range(1, count + 1)] * 2,
+            same(rows[:, 0].sum()),
+            same(rows[:, 1].sum()),
+            same(mean[0]),
+            same(P[0]),
+            same(g.sum(axis=0)),
+            same(H.sum(axis=0)),
+            u @ g[:, :GRASP],
+            np.tensordot(u, H[:, :, :GRASP], 1),
+            np.tensordot(u**2, H[:, :GRASP, :GRASP], 1),
+        )
+        found = explain(data, np.zeros(S), np.zeros(S))
+        first, second = found[:count], found[count:]
+        return max(first, key=lambda jump: jump.evidence), max(second, key=lambda jump: jump.evidence)
+
+    def _known(self, starts: list[int], give: FloatArray) -> tuple[FloatArray, FloatArray]:
+        rows = self._snapshots.last(starts[-1] + GUARD)[::-1][np.array(starts) + GUARD - 1]
+        P = rows[:, self.size :].reshape(-1, self.size, self.size)
+        P[:, range(GRASP), range(GRASP)] += give
+        return rows[:, : self.size], P
+
+    def _older(self, starts: list[int]) -> tuple[FloatArray, FloatArray]:
+        """Cost and number of residuals (S,) of the segments held that end before each start."""
+        rows = self._segments.last(self._segments.kept)[::-1, :2]
+        sums = np.cumsum(rows, axis=0)
+        older = sums[-1] - sums[np.array(starts) + GUARD - 1]
+        return older[:, 0], older[:, 1]
 
 
 class Segments(NamedTuple):
@@ -195,8 +209,8 @@ class Segments(NamedTuple):
     change_information: FloatArray
 
 
-def explain(data: Segments, whole_cost: float, whole_count: float) -> list[Jump]:
-    """Evidence for a change since each start; `whole_cost` and `whole_count` are those of all segments held."""
+def explain(data: Segments, older_cost: FloatArray, older_count: FloatArray) -> list[Jump]:
+    """Evidence for a change since each start; `older_cost` and `older_count` (S,) are those of the segments before."""
     mean, P, g, H = data.mean, data.covariance, data.gradient, data.information
     n = g.shape[1]
     Hm = np.matmul(H, mean[:, :, None])[:, :, 0]
@@ -218,9 +232,9 @@ def explain(data: Segments, whole_cost: float, whole_count: float) -> list[Jump]
     gain = square / (1.0 + square * values)
     drop = np.sum(gain * y**2, axis=2)
     occam = 0.5 * np.sum(np.log1p(square * values), axis=2)
-    older = np.maximum(2.0 * (whole_cost - data.cost), 0.0)
     factor = _student(_PRIOR_RESIDUALS + rss, drop, _PRIOR_RESIDUALS + data.count) - occam
-    evidence = _student(_PRIOR_RESIDUALS + older + rss, drop, _PRIOR_RESIDUALS + whole_count) - occam
+    before, level = _PRIOR_RESIDUALS + 2.0 * older_cost + rss, _PRIOR_RESIDUALS + older_count + data.count
+    evidence = _student(before, drop, level) - occam
     best = np.argmax(evidence, axis=0)
     out = []
     for s, k in enumerate(data.starts):
@@ -234,7 +248,7 @@ def explain(data: Segments, whole_cost: float, whole_count: float) -> list[Jump]
     return out
 
 
-def _student(before: FloatArray, drop: FloatArray, count: FloatArray | float) -> FloatArray:
+def _student(before: FloatArray, drop: FloatArray, count: FloatArray) -> FloatArray:
     """Log likelihood ratio of `count` residuals of unknown common variance whose sum of squares `before` a change lowers by `drop`."""
     after = np.maximum(before - drop, 1e-3 * before)
     return np.asarray(0.5 * count * np.log(before / after))

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import fields
+
 import numpy as np
 
 from factorgrasp.online.moment_solver import Fit, Moment
@@ -16,7 +19,25 @@ from factorgrasp.problems.grasp_noise import (
 )
 from factorgrasp.problems.grasp_settings import GraspNoise, GraspSettings
 from factorgrasp.problems.grasp_system import floored_inverse
+from factorgrasp.problems.grasp_windows import Windowing
 from factorgrasp.typing import FloatArray
+
+
+# Points a bin over which a density is averaged, and half their range in bins: the spectrum of the sine taper.
+_POINTS, _RANGE = 25, 1.5
+
+
+def bin_averages(robot: Callable[[FloatArray], RobotNoise], windowing: Windowing) -> RobotNoise:
+    """Densities of the robot's noise (K,) as the windows see them: averages over each bin, which matter where bins are wide."""
+    offset = np.linspace(-_RANGE, _RANGE, _POINTS)
+    n = np.arange(windowing.length)
+    taper = np.sin(np.pi * (n + 0.5) / windowing.length)
+    weight = np.abs(np.exp(-2j * np.pi * np.outer(offset, n) / windowing.length) @ taper) ** 2
+    weight /= weight.sum()
+    spacing = 1.0 / (windowing.length * windowing.step)
+    fine = np.abs(windowing.frequencies[:, None] + spacing * offset)
+    density = robot(fine.ravel())
+    return RobotNoise(*(getattr(density, f.name).reshape(fine.shape) @ weight for f in fields(RobotNoise)))
 
 
 class Level:

@@ -7,7 +7,13 @@ from typing import Literal, Protocol
 import numpy as np
 
 from factorgrasp import lie, signals
-from factorgrasp.online.stream_pieces import GapCutter, GridInterpolator, Piece, interpolate_poses, interpolate_rows
+from factorgrasp.online.stream_pieces import (
+    GapCutter,
+    GridInterpolator,
+    Piece,
+    interpolate_poses,
+    interpolate_rows,
+)
 from factorgrasp.problems.grasp_kinematics import DERIVATIVE_ORDER, to_body
 from factorgrasp.problems.grasp_recording import vech_products
 from factorgrasp.typing import FloatArray

@@ -14,8 +14,8 @@ from factorgrasp.online.change_watch import Change, ChangeWatch, DetectorSetting
 from factorgrasp.online.coupled_rows import ACCELEROMETER, GYRO, row_width, shift_hand
 from factorgrasp.online.events import GraspEvent
 from factorgrasp.online.fitter import GraspFitter
-from factorgrasp.online.jump_detector import GRASP
-from factorgrasp.online.level import Level
+from factorgrasp.online.jump_detector import GRASP, REACH
+from factorgrasp.online.level import Level, bin_averages
 from factorgrasp.online.moment_solver import Fit, retract
 from factorgrasp.online.row_history import RowHistory
 from factorgrasp.online.stream_pieces import Piece
@@ -26,16 +26,19 @@ from factorgrasp.problems.grasp_settings import GraspNoise, GraspPrior, GraspSet
 from factorgrasp.problems.grasp_windows import Windowing
 from factorgrasp.typing import FloatArray, State
 
-# s; the jump test looks at windows of twice this length, one every such time.
-SEGMENT = 0.1
+# s; the change detector looks at windows of twice this length, one every such time.
+SEGMENT = 0.04
 # Reviews of the weights: often while the estimate is young, then now and then (s of data).
 _YOUNG, _OFTEN, _SELDOM = 5.0, 0.5, 3.0
 # Other local optima are looked for within the first seconds only.
 _SURE = 20.0
 # A remaining clock offset above this (s) is applied to the data; the model is linear in what remains.
 _SETTLED_OFFSET = 1e-4
-# A change that is found this soon (s) after another one is the same one going on; if it goes on longer than that, the hand slips.
-_SAME_CHANGE = 3.0
+# s; a change that is found this soon after another one is the same one going on, as is a small one (and a drift) a little later. What goes on
+# for longer than the latter is a slip.
+_SAME_CHANGE, _AFTERMATH = 1.0, 4.0
+# s; before so much data of the grasp after, the detector knows better how far a change went.
+_SETTLING = 0.5
 _MOST_EVENTS = 256
 
 
@@ -79,10 +82,10 @@ class GraspTracker:
         def level(length: int) -> Level:
             windowing = Windowing(step, length, max(2, int(bandwidth * length * step + 1e-9) + 1))
             bank = WindowBank(windowing, self.hop, width, settings.forgetting_time, self._loss is not None)
-            return Level(bank, robot(windowing.frequencies), noise, settings, lever_arm)
+            return Level(bank, bin_averages(robot, windowing), noise, settings, lever_arm)
 
         self.fitter = GraspFitter(level(2 * self.segment), level(2 * half), noise, settings, prior)
-        self.history = RowHistory(52 * self.segment + 2 * half, row_width(settings.base_tilt))
+        self.history = RowHistory((REACH + 4) * self.segment + 2 * half, row_width(settings.base_tilt))
         self._watch = None
         if detector is not None:
             self._watch = ChangeWatch(self.fitter, self.segment, row_width(settings.base_tilt), detector)
@@ -198,7 +201,8 @@ class GraspTracker:
             return
         if self._watch is not None:
             self._watch.add(self.history)
-            change = self._watch.find(self.history)
+            alert = bool(self._events) and self.time - self._events[-1].until < _AFTERMATH
+            change = self._watch.find(self.history, alert)
             if change is not None:
                 self._start_afresh(change)
                 return
@@ -240,8 +244,8 @@ class GraspTracker:
     def _note(self, change: Change) -> None:
         """Put a change on record; one that follows another at once is that one, going on."""
         now, last, jump = self.time, self._events[-1] if self._events else None, change.jump
-        if last is not None and self._before is not None and change.time - last.until < _SAME_CHANGE:
-            drifts = "slip" in (change.kind, last.kind) or now - last.time > _SAME_CHANGE
+        if last is not None and self._before is not None and self._goes_on(last, change):
+            drifts = "slip" in (change.kind, last.kind) or now - last.time > _AFTERMATH
             after = retract(self.fitter.model, change.before, _padded(jump.step, self.fitter.model.size))
             self._events[-1] = replace(
                 last,
@@ -260,16 +264,22 @@ class GraspTracker:
             GraspEvent(change.kind, change.time, now, now, jump.step, jump.covariance, jump.log_bayes_factor)
         )
 
+    def _goes_on(self, last: GraspEvent, change: Change) -> bool:
+        since = change.time - last.until
+        if change.large and change.kind == "regrasp" and last.kind == "regrasp":
+            return since < _SAME_CHANGE
+        return since < _AFTERMATH
+
     def _refined(self, event: GraspEvent) -> GraspEvent:
         """The event with the difference between the estimates after and before, where that is known better."""
         fit = self.fitter.fit
-        if fit is None or self._before is None:
+        if fit is None or self._before is None or self.seconds < _SETTLING:
             return event
         before, P = self._before
         turn = np.eye(GRASP)
         turn[:3, :3] = fit.state["rotation"].T @ before["rotation"]
         covariance = turn @ P @ turn.T + self.fitter.covariance()[:GRASP, :GRASP]
-        if np.any(np.diag(covariance) > 4.0 * np.diag(event.covariance)):
+        if event.kind == "regrasp" and np.sum(np.diag(covariance) / np.diag(event.covariance)) > GRASP:
             return event
         return replace(event, step=_between(before, fit.state), covariance=covariance)
 

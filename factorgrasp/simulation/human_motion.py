@@ -139,7 +139,8 @@ def realise(body: HumanBody, model: Any, plan: Plan, t: FloatArray, balance: Any
         for side, _sign in _SIDES:
             for name, values in _leg(body, side, pelvis, plan.pelvis_pitch, plan.ankles[side]).items():
                 q[:, columns[name]] = values
-        com = np.array([pin.centerOfMass(balance, data, row)[:2] for row in q])
+        # A copy: what pinocchio returns is a view of its one result.
+        com = np.array([pin.centerOfMass(balance, data, row)[:2].copy() for row in q])
         miss = com - plan.com
         pelvis[:, :2] -= 1.15 * miss
         if np.abs(miss).max() < 1e-5:

@@ -1,0 +1,166 @@
+"""Human dynamics frame by frame: everything that does not change is worked out once, a step fills in values and solves.
+
+Memory does not grow, and a step does no work that depends on how many came before. Without constraints a step is one factorisation; its time varies
+by the number of refinements alone.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from factorgrasp.errors import InputError
+from factorgrasp.problems.human_dynamics_sensors import Sensor
+from factorgrasp.problems.human_dynamics_settings import HumanDynamicsNoise
+from factorgrasp.problems.human_dynamics_system import HumanDynamicsSystem
+from factorgrasp.problems.human_dynamics_whitening import Whitening
+from factorgrasp.problems.link_motion import LinkKinematics
+from factorgrasp.problems.link_motion_pinocchio import PinocchioTree
+from factorgrasp.solvers.frames import FrameResult, FrameSolver
+from factorgrasp.status import Status
+from factorgrasp.typing import FloatArray
+
+
+@dataclass(frozen=True)
+class HumanDynamicsFrame:
+    """Estimate of one frame.
+
+    Attributes
+    ----------
+    t : float
+        s.
+    torque, torque_sd : ndarray
+        (dofs,) Nm; sd empty when no covariance was asked for.
+    external_wrench : ndarray
+        (L, 6) in the links' frames, N and Nm.
+    external_wrench_covariance : ndarray
+        (L, 6, 6); empty without covariance.
+    joint_wrench : ndarray
+        (J, 6) parent on child in the child's frame, N and Nm.
+    status : Status
+    message : str
+    latency : float
+        Seconds that the step took.
+    """
+
+    t: float
+    torque: FloatArray
+    torque_sd: FloatArray
+    external_wrench: FloatArray
+    external_wrench_covariance: FloatArray
+    joint_wrench: FloatArray
+    status: Status
+    message: str
+    latency: float
+
+
+class OnlineHumanDynamics:
+    """Streaming form of :class:`factorgrasp.problems.human_dynamics.HumanDynamics`, without constraints.
+
+    Parameters
+    ----------
+    tree : PinocchioTree
+        The body.
+    sensors : sequence of Sensor
+        As templates: kind, place and covariance count, their single row of values does not.
+    noise : HumanDynamicsNoise
+    contacts : sequence of str
+    use_motion : bool
+        As for the problem.
+    covariance : bool
+        Also compute sd of torques and covariances of external wrenches.
+    """
+
+    def __init__(
+        self,
+        tree: PinocchioTree,
+        sensors: Sequence[Sensor],
+        noise: HumanDynamicsNoise | None = None,
+        contacts: Sequence[str] = (),
+        use_motion: bool = True,
+        covariance: bool = True,
+    ) -> None:
+        self.tree, self.covariance = tree, covariance
+        one = []
+        for sensor in sensors:
+            if sensor.variances().ndim > (2 if sensor.values.shape[0] == 1 else 1) and sensor.values.shape[0] > 1:
+                raise InputError(f"covariance of {sensor.name}", "one that does not change over frames", "one a frame")
+            one.append(replace(sensor, values=sensor.values[:1]))
+        self.sensors = tuple(one)
+        self.system = HumanDynamicsSystem(tree.tree, self.sensors, noise, contacts, use_motion)
+        self._whitening = Whitening(self.system, self.sensors)
+        wanted = [*self.system.columns.joint_wrench, *self.system.columns.external_wrench] if covariance else []
+        self._solver = FrameSolver(self.system.pattern, wanted)
+        self._places = {sensor.name: where for sensor, where in zip(self.sensors, self.system.value_slices, strict=True)}
+        self._owner = np.concatenate([np.full(len(tree.tree.dofs[j]), j) for j in self.system.axes] or [np.empty(0)]).astype(np.intp)
+        self.frames = 0
+        self.worst_latency = 0.0
+
+    def step(
+        self, t: float, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, values: Mapping[str, ArrayLike]
+    ) -> HumanDynamicsFrame:
+        """Estimate of one frame.
+
+        Parameters
+        ----------
+        t : float
+            s.
+        q, qd, qdd : array_like
+            In pinocchio's order.
+        values : mapping of str to (k,) array_like
+            Measurements by the sensor's name; a sensor that is not named, or NaN, has no rows in this frame.
+
+        Raises
+        ------
+        InputError
+            For a name that no sensor has, or a value of another size.
+        """
+        started = time.perf_counter()
+        return self._finish(t, self.tree.kinematics(q, qd, qdd), values, started)
+
+    def step_links(self, t: float, kinematics: LinkKinematics, values: Mapping[str, ArrayLike]) -> HumanDynamicsFrame:
+        """The same from kinematics of one frame, such as ``LinkMotion.kinematics(slice(k, k + 1))``."""
+        if kinematics.count != 1:
+            raise InputError("kinematics", "one frame", str(kinematics.count))
+        return self._finish(t, kinematics, values, time.perf_counter())
+
+    def _finish(self, t: float, k: LinkKinematics, values: Mapping[str, ArrayLike], started: float) -> HumanDynamicsFrame:
+        rows = self._rows(values)
+        entries, rhs = self.system.raw(k, rows)
+        self._whitening.apply(entries, rhs, rows, slice(0, 1))
+        result = self._solver.solve(entries, rhs, self.covariance)
+        return self._read(t, k, result, started)
+
+    def _rows(self, values: Mapping[str, ArrayLike]) -> FloatArray:
+        size = self.system.value_slices[-1].stop if self.sensors else 0
+        out = np.full((1, size), np.nan)
+        row = out[0]
+        for name, value in values.items():
+            where = self._places.get(name)
+            if where is None:
+                raise InputError("values", "names among " + ", ".join(sorted(self._places)), repr(name))
+            if np.shape(value) != (where.stop - where.start,):
+                raise InputError(name, f"shape ({where.stop - where.start},)", str(np.shape(value)))
+            row[where] = value
+        return out
+
+    def _read(self, t: float, k: LinkKinematics, result: FrameResult, started: float) -> HumanDynamicsFrame:
+        columns, x, S = self.system.columns, result.x[0], k.axes[0]
+        wrench = x[columns.joint_wrench]
+        torque = np.einsum("di,di->d", S, wrench[self._owner])
+        sd, cov = np.empty(0), np.empty((0, 6, 6))
+        if self.covariance:
+            joints = wrench.shape[0]
+            P = np.stack(result.marginals)[:, 0]
+            sd = np.sqrt(np.maximum(np.einsum("di,dij,dj->d", S, P[self._owner], S), 0.0))
+            cov = P[joints:]
+        self.frames += 1
+        latency = time.perf_counter() - started
+        self.worst_latency = max(self.worst_latency, latency)
+        return HumanDynamicsFrame(
+            float(t), torque, sd, x[columns.external_wrench], cov, wrench, result.status[0], result.messages.get(0, ""), latency
+        )
