@@ -20,9 +20,8 @@ from factorgrasp.human_dynamics_inputs import (
     read_sensors,
     read_wrenches,
 )
-from factorgrasp.human_dynamics_motion import BodyMotion, read_body_motion
+from factorgrasp.human_dynamics_motion import BodyMotion, Vector, read_body_motion
 from factorgrasp.human_dynamics_task import HumanDynamicsTask
-from factorgrasp.problems.human_dynamics import HumanDynamics
 from factorgrasp.problems.human_dynamics_constraints import DynamicsConstraint, TorqueLimit, feet_on_the_floor
 from factorgrasp.problems.human_dynamics_settings import HumanDynamicsNoise, PerName
 from factorgrasp.toml_tables import check_keys, close_matches, convert, get, place, sub_table
@@ -52,7 +51,7 @@ def build(table: Mapping[str, Any], base_dir: Path) -> HumanDynamicsTask:
     """
     check_keys(table, TABLES, "")
     contacts, constraints = sub_table(table, "contacts"), sub_table(table, "constraints")
-    check_keys(contacts, ("unmeasured", "payload"), "[contacts]")
+    check_keys(contacts, ("unmeasured", "payload", "points", "method"), "[contacts]")
     check_keys(
         constraints,
         ("feet", "friction", "corners", "position", "rotation_wxyz", "torque_limits", "hard_dynamics"),
@@ -71,15 +70,30 @@ def build(table: Mapping[str, Any], base_dir: Path) -> HumanDynamicsTask:
     for link in payload:
         if link not in unmeasured:
             raise InputError("[contacts] payload", "links of [contacts] unmeasured", repr(link))
-    problem = HumanDynamics(
+    points: dict[str, tuple[float, ...]] = {}
+    for link, point in sub_table(contacts, "points").items():
+        field = f"[contacts.points] {link}"
+        if link not in unmeasured:
+            raise InputError(
+                field, "a link of [contacts] unmeasured", "none", close_matches(link, unmeasured)
+            )
+        points[link] = convert(point, Vector, field)
+    method = get(contacts, "method", Literal["joint", "two_tasks"], "[contacts]", "joint")
+    if method == "two_tasks" and points:
+        raise InputError("[contacts] method", '"joint", where points are given', repr(method))
+    return HumanDynamicsTask(
         body.motion,
         sensors,
-        noise,
-        unmeasured,
-        _constraints(constraints, body),
+        body.clock,
+        body.good,
+        noise=noise,
+        contacts=unmeasured,
+        points=points,
+        payload=payload,
+        method=method,
+        constraints=_constraints(constraints, body),
         hard_dynamics=get(constraints, "hard_dynamics", bool, "[constraints]", False),
     )
-    return HumanDynamicsTask(problem, body.clock, body.good, payload)
 
 
 def _noise(covariance: Mapping[str, Any], body: BodyMotion) -> HumanDynamicsNoise:
@@ -91,9 +105,8 @@ def _noise(covariance: Mapping[str, Any], body: BodyMotion) -> HumanDynamicsNois
         "latella2018": HumanDynamicsNoise.latella2018,
         "tirupachuri2021": HumanDynamicsNoise.tirupachuri2021,
     }[preset]()
-    if body.acceleration_variance is not None:
-        noise = replace(noise, joint_acceleration=body.acceleration_variance)
-    stated: dict[str, PerName] = {}
+    # What follows from the motion goes before a preset, what is stated here before both.
+    stated: dict[str, PerName] = dict(body.variances)
     for key in _NOISE:
         if key in covariance:
             known = [j.name for j in body.motion.joints] if key in _OF_JOINTS else list(body.motion.links)

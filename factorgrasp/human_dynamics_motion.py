@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,6 +14,7 @@ from factorgrasp.errors import InputError
 from factorgrasp.models.anthropometry import Sex
 from factorgrasp.models.human import human_body, load_body
 from factorgrasp.models.joint_motion import differentiate_configurations
+from factorgrasp.problems.human_dynamics_settings import PerName
 from factorgrasp.problems.link_motion import GRAVITY, LinkMotion
 from factorgrasp.problems.link_motion_files import load_links
 from factorgrasp.problems.link_motion_pinocchio import PinocchioTree
@@ -42,14 +43,15 @@ class BodyMotion:
         Frames in which the whole motion is known; the others are gaps.
     motion : LinkMotion
         Of the good frames.
-    acceleration_variance : float or None
-        Of the joint accelerations, (rad/s^2)^2, from the stated noise of the angles through the filter that differentiated them.
+    variances : dict
+        `joint_acceleration` and `link_acceleration` of :class:`HumanDynamicsNoise`, as far as they follow from the stated noise of angles and
+        pose through the filter that differentiated them.
     """
 
     clock: FloatArray
     good: BoolArray
     motion: LinkMotion
-    acceleration_variance: float | None = None
+    variances: Mapping[str, PerName] = field(default_factory=dict)
 
 
 def read_body_motion(table: Mapping[str, Any], base_dir: Path) -> BodyMotion:
@@ -120,13 +122,15 @@ def _from_links(model: Mapping[str, Any], motion: Mapping[str, Any], base_dir: P
 
 
 def _known(
-    clock: FloatArray, good: BoolArray, motion: LinkMotion, variance: float | None = None
+    clock: FloatArray, good: BoolArray, motion: LinkMotion, variances: Mapping[str, PerName] | None = None
 ) -> BodyMotion:
     if not good.any():
         raise InputError(
             "[motion]", "at least one frame in which all of the motion is known", "gaps everywhere"
         )
-    return BodyMotion(clock, good, motion.select(good) if len(motion) == good.size else motion, variance)
+    return BodyMotion(
+        clock, good, motion.select(good) if len(motion) == good.size else motion, variances or {}
+    )
 
 
 def _span(t: FloatArray, motion: Mapping[str, Any]) -> BoolArray:
@@ -141,7 +145,7 @@ def _span(t: FloatArray, motion: Mapping[str, Any]) -> BoolArray:
 
 
 _JOINT_KEYS = (
-    "file", "columns", "translations", "rate", "bandwidth", "others", "angle_sd", "start", "end", "max_gap",
+    "file", "columns", "translations", "rate", "bandwidth", "others", "angle_sd", "position_sd", "orientation_sd", "start", "end", "max_gap",
 )  # fmt: skip
 
 
@@ -208,11 +212,24 @@ def _from_joints(
             "[motion]", "a stretch without gaps that is longer than the filter of the derivatives", "none"
         )
     tree = PinocchioTree(model, gravity=gravity)
-    sd = get(motion, "angle_sd", float, where, None)
-    variance = None if sd is None else sd**2 * moved.acceleration_gain
+    variances: dict[str, PerName] = {}
+    if (angle := get(motion, "angle_sd", float, where, None)) is not None:
+        variances["joint_acceleration"] = _variance(angle, "angle_sd") * moved.acceleration_gain
+    position, turn = (get(motion, key, float, where, None) for key in ("position_sd", "orientation_sd"))
+    if (position is None) != (turn is None):
+        raise InputError("[motion] position_sd, orientation_sd", "both or none", "one of them")
+    if position is not None:
+        parts = _variance(position, "position_sd"), _variance(turn, "orientation_sd")
+        variances["link_acceleration"] = tuple(moved.acceleration_gain * v for v in parts for _ in range(3))
     return _known(
-        clock, good, tree.motion(clock[good], moved.q[good], moved.qd[good], moved.qdd[good]), variance
+        clock, good, tree.motion(clock[good], moved.q[good], moved.qd[good], moved.qdd[good]), variances
     )
+
+
+def _variance(sd: float, key: str) -> float:
+    if sd <= 0.0:
+        raise InputError(f"[motion] {key}", "a standard deviation above 0", f"{sd:g}")
+    return sd**2
 
 
 def _hinges(model: Any) -> list[str]:

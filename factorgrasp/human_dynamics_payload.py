@@ -1,7 +1,8 @@
-"""The mass of an object that hands hold, from the wrenches that nobody measured (mathematics 4.2)."""
+"""Contacts without a sensor, and the mass of what they hold (mathematics 4.2)."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,10 +12,12 @@ from factorgrasp.least_squares import LeastSquares
 from factorgrasp.problems.human_dynamics import HumanDynamics
 from factorgrasp.problems.human_dynamics_estimate import HumanDynamicsEstimate
 from factorgrasp.problems.human_dynamics_sensors import WrenchSet
-from factorgrasp.problems.human_dynamics_settings import resolve
+from factorgrasp.problems.human_dynamics_settings import HumanDynamicsNoise, resolve
+from factorgrasp.problems.link_motion import LinkMotion
+from factorgrasp.problems.link_motion_spatial import skew
 from factorgrasp.typing import FloatArray, IntArray
 
-_NAME = "wrenches of what is held"
+CONTACTS = "unmeasured contacts"
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,48 +47,51 @@ class Payload:
         return f"{' and '.join(self.links)} hold {self.mean:.3f} kg (sd {self.mean_sd:.3f} kg in one frame)"
 
 
-def solve_with_payload(
-    problem: HumanDynamics, links: tuple[str, ...], solver: str | None
-) -> tuple[HumanDynamicsEstimate, Payload]:
-    """Solve all frames, and the mass of the one object that some links hold.
+def contact_rows(
+    motion: LinkMotion, noise: HumanDynamicsNoise, links: tuple[str, ...], points: Mapping[str, FloatArray]
+) -> WrenchSet:
+    """The zeros that stand for unmeasured wrenches, as one measurement of all of them, so that their joint covariance comes out.
 
-    Parameters
-    ----------
-    problem : HumanDynamics
-        With `links` among its contacts.
-    links : tuple of str
-    solver : str or None
+    The variances (`contact_wrench` of the noise) are those of force and moment at a contact's point, which is the link's origin unless `points`
+    says otherwise: a hand that holds something at its middle exerts a moment about the wrist.
+    """
+    loose = resolve(noise.contact_wrench, motion.links, [6] * len(motion.links), "contact_wrench")
+    covariance = np.zeros((6 * len(links), 6 * len(links)))
+    for k, link in enumerate(links):
+        shift = np.eye(6)
+        shift[3:, :3] = skew(np.asarray(points.get(link, np.zeros(3)), dtype=float))
+        part = slice(6 * k, 6 * k + 6)
+        covariance[part, part] = shift @ np.diag(loose[motion.link(link)]) @ shift.T
+    return WrenchSet(np.zeros((len(motion), len(covariance))), covariance, CONTACTS, links=links)
 
-    Notes
-    -----
-    On hands with the acceleration a, an object of mass m pulls with ``F = m (g - a)``. The posterior of F, the sum of the hands' forces,
-    holds a zero-mean prior (the noise's `contact_wrench` and `prior_external_wrench`), which draws masses towards zero. It is taken out:
-    with the posterior ``N(mu, P)`` and the prior ``N(0, P0)`` the data alone say ``m = u' P^-1 mu / u' (P^-1 - P0^-1) u``, ``u = g - a``,
-    with one over the denominator as variance. Errors of different hands go with each other; their joint covariance is used.
+
+def solve_with_contacts(
+    problem: HumanDynamics, solver: str | None
+) -> tuple[HumanDynamicsEstimate, FloatArray, FloatArray]:
+    """All frames of a problem that has :func:`contact_rows`.
+
+    Returns
+    -------
+    HumanDynamicsEstimate
+        Without the agreement of the contacts' zeros, which are no sensor.
+    ndarray, shape (n, 6 k)
+        Wrenches of the contacts, each in its link's frame.
+    ndarray, shape (n, 6 k, 6 k)
+        Their joint covariance.
     """
     from factorgrasp.solvers.frames import solve_frames
 
-    # The zeros that stand for these links' wrenches as one measurement of all of them: the same rows, and their joint covariance is known.
-    motion, system = problem.motion, problem.system
-    loose = resolve(problem.noise.contact_wrench, motion.links, [6] * len(motion.links), "contact_wrench")
-    variances = np.concatenate([loose[motion.link(link)] for link in links])
-    zeros = WrenchSet(np.zeros((len(problem), variances.size)), np.diag(variances), _NAME, links=links)
-    others = tuple(link for link in system.contacts if link not in links)
-    watched = HumanDynamics(
-        motion, (*problem.sensors, zeros), problem.noise, others, problem.constraints, system.hard_dynamics
-    )
-    keeper = _Keeper(watched)
+    keeper = _Keeper(problem)
     frames: HumanDynamicsEstimate = solve_frames(keeper, solver)
-    found = watched.system
-    group = found.touched(next(rows for rows in found.sensors if rows.name == _NAME))
+    system = problem.system
+    group = system.touched(next(rows for rows in system.sensors if rows.name == CONTACTS))
     P = next(
         block
-        for where, block in zip(found.marginals, keeper.result.marginals, strict=True)
+        for where, block in zip(system.marginals, keeper.result.marginals, strict=True)
         if np.array_equal(where, group)
     )
-    payload = _mass(watched, links, keeper.result.x[:, group], P)
-    kept = tuple(one for one in frames.innovations if one.name != _NAME)
-    return replace(frames, innovations=kept), payload
+    kept = tuple(one for one in frames.innovations if one.name != CONTACTS)
+    return replace(frames, innovations=kept), keeper.result.x[:, group], P
 
 
 class _Keeper:
@@ -118,33 +124,56 @@ class _Keeper:
         return self._problem.view_frames(result)
 
 
-def _mass(problem: HumanDynamics, links: tuple[str, ...], x: FloatArray, P: FloatArray) -> Payload:
-    motion, noise = problem.motion, problem.noise
+def payload_of(
+    motion: LinkMotion,
+    noise: HumanDynamicsNoise,
+    contacts: tuple[str, ...],
+    links: tuple[str, ...],
+    x: FloatArray,
+    P: FloatArray,
+) -> Payload:
+    """The mass of the one object that some of the contacts hold.
+
+    Parameters
+    ----------
+    motion : LinkMotion
+    noise : HumanDynamicsNoise
+    contacts, links : tuple of str
+        All contacts, and those that hold the object.
+    x, P : ndarray
+        (n, 6 k) and (n, 6 k, 6 k), of all contacts.
+
+    Notes
+    -----
+    On hands with the acceleration a, an object of mass m pulls with ``F = m (g - a)``. The posterior of F, the sum of the hands' forces,
+    holds a zero-mean prior (the noise's `contact_wrench` and `prior_external_wrench`), which draws masses towards zero. It is taken out:
+    with the posterior ``N(mu, P)`` and the prior ``N(0, P0)`` the data alone say ``m = u' P^-1 mu / u' (P^-1 - P0^-1) u``, ``u = g - a``,
+    with one over the denominator as variance. Errors of different hands go with each other; their joint covariance is used.
+    """
     at = [motion.link(link) for link in links]
     R = motion.R[:, at]
-    # Sum of the forces in the world as a linear read-out of the links' wrenches.
-    read = np.zeros((len(motion), 3, 6 * len(links)))
-    for k in range(len(links)):
-        read[:, :, 6 * k : 6 * k + 3] = R[:, k]
-    force = (read @ x[:, :, None])[..., 0]
-    covariance = read @ P @ np.swapaxes(read, 1, 2)
+    # Sum of the forces in the world as a linear read-out of the contacts' wrenches.
+    read = np.zeros((len(motion), 3, 6 * len(contacts)))
     prior = np.zeros((len(motion), 3, 3))
     sizes = [6] * len(motion.links)
     loose = resolve(noise.contact_wrench, motion.links, sizes, "contact_wrench")
     wide = resolve(noise.prior_external_wrench, motion.links, sizes, "prior_external_wrench")
-    for k, i in enumerate(at):
+    for k, (link, i) in enumerate(zip(links, at, strict=True)):
+        first = 6 * contacts.index(link)
+        read[:, :, first : first + 3] = R[:, k]
         variance = 1.0 / (1.0 / loose[i][:3] + 1.0 / wide[i][:3])
         prior += R[:, k] @ (variance[:, None] * np.swapaxes(R[:, k], 1, 2))
+    force = (read @ x[:, :, None])[..., 0]
+    covariance = read @ P @ np.swapaxes(read, 1, 2)
     u = motion.gravity - motion.acceleration[:, at].mean(axis=1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        good = np.isfinite(covariance).all(axis=(1, 2))
-        posterior = np.linalg.inv(np.where(good[:, None, None], covariance, np.eye(3)))
-        information = np.einsum("ni,nij,nj->n", u, posterior - np.linalg.inv(prior), u)
-        mass = np.einsum("ni,nij,nj->n", u, posterior, force) / information
-        known = good & (information > 0.0)
-        mass, sd = np.where(known, mass, np.nan), np.where(known, 1.0 / np.sqrt(information), np.nan)
-    weight = np.where(known, information, 0.0)
+    good = np.isfinite(covariance).all(axis=(1, 2))
+    posterior = np.linalg.inv(np.where(good[:, None, None], covariance, np.eye(3)))
+    information = np.einsum("ni,nij,nj->n", u, posterior - np.linalg.inv(prior), u)
+    known = good & (information > 0.0)
+    safe = np.where(known, information, 1.0)
+    mass = np.where(known, np.einsum("ni,nij,nj->n", u, posterior, force) / safe, np.nan)
+    sd = np.where(known, 1.0 / np.sqrt(safe), np.nan)
     if not known.any():
         return Payload(links, mass, sd, float("nan"), float("nan"))
-    mean = float(np.sum(np.where(known, weight * mass, 0.0)) / weight.sum())
+    mean = float(np.sum(safe[known] * mass[known]) / safe[known].sum())
     return Payload(links, mass, sd, mean, float(np.nanmedian(sd)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,6 +21,7 @@ from factorgrasp.report import (
     Table,
     decimals,
     join_words,
+    observability_section,
     quantity,
     significant,
 )
@@ -45,6 +47,8 @@ def build(result: HumanDynamicsResult) -> Report:
     sections = [_moments(result), _forces(result)]
     if result.payload is not None:
         sections.append(_payload(result))
+    if result.estimate.observability is not None:
+        sections.append(_contacts(result))
     sections += [_table(result), _agreement(result)]
     if frames.active:
         sections.append(_active(result))
@@ -144,6 +148,23 @@ def _payload(result: HumanDynamicsResult) -> Section:
         "counted in. A body whose mass is wrong shows here as a held mass of the difference.",
         svg=plots.to_svg(made, "payload"),
         caption="Frame by frame, with the 95 % band.",
+    )
+
+
+def _contacts(result: HumanDynamicsResult) -> Section:
+    """What the momentum of the body tells of contacts without a sensor."""
+    known = observability_section(result.estimate)
+    text = (
+        "Six equations, the rate of the whole body's momentum, tell of all contacts that nobody measures. In red is what they leave open: "
+        "there the estimate is what the prior says. "
+    )
+    advice = result.estimate.observability.advice if result.estimate.observability else ""
+    caption = "A full bar: known a thousand times better than the prior's standard deviation; an empty one: no better than that."
+    return replace(
+        known,
+        title="What is known of the contacts without a sensor",
+        text=text + (advice and advice + "."),
+        caption=caption,
     )
 
 

@@ -2,25 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from factorgrasp.errors import InputError
 from factorgrasp.estimate import Estimate, TermSummary
-from factorgrasp.human_dynamics_payload import Payload, solve_with_payload
+from factorgrasp.human_dynamics_payload import Payload, contact_rows, payload_of, solve_with_contacts
 from factorgrasp.least_squares import LeastSquares
+from factorgrasp.problems.external_wrenches import ExternalWrenches
+from factorgrasp.problems.external_wrenches_estimate import ExternalWrenchesEstimate
 from factorgrasp.problems.human_dynamics import HumanDynamics
+from factorgrasp.problems.human_dynamics_constraints import DynamicsConstraint
 from factorgrasp.problems.human_dynamics_estimate import HumanDynamicsEstimate
 from factorgrasp.problems.human_dynamics_innovations import Innovation
-from factorgrasp.problems.human_dynamics_sensors import ExternalWrench
+from factorgrasp.problems.human_dynamics_sensors import ExternalWrench, Sensor
+from factorgrasp.problems.human_dynamics_settings import HumanDynamicsNoise
 from factorgrasp.problems.human_dynamics_words import agreement_words
+from factorgrasp.problems.link_motion import LinkMotion
 from factorgrasp.problems.link_motion_spatial import rotate
 from factorgrasp.provenance import problem_hash, versions
 from factorgrasp.status import Status
+from factorgrasp.toml_tables import close_matches
 from factorgrasp.typing import BoolArray, FloatArray, JsonDict
 
 _COLUMNS = ("fx", "fy", "fz", "mx", "my", "mz")
@@ -50,7 +57,10 @@ class Weighing:
         off = self.mass - self.model
         verdict = "they agree"
         if abs(off) > max(3.0 * self.sd, 0.005 * self.model):
-            verdict = f"the model is {'too heavy' if off < 0.0 else 'too light'} by {100.0 * abs(off) / self.model:.1f} %, or something is held or leant on"
+            verdict = (
+                f"the model is {'too heavy' if off < 0.0 else 'too light'} by {100.0 * abs(off) / self.model:.1f} %, "
+                "or something is held or leant on"
+            )
         return f"the measured forces weigh {self.mass:.2f} kg (sd {self.sd:.2f}), the model {self.model:.2f} kg: {verdict}"
 
 
@@ -59,50 +69,106 @@ class HumanDynamicsTask:
 
     Parameters
     ----------
-    problem : HumanDynamics
+    motion : LinkMotion
         At the good frames.
-    clock : (n,) ndarray
-        All frames, s.
-    good : (n,) ndarray of bool
-        Frames that `problem` has.
+    sensors : sequence of Sensor
+        At the good frames.
+    clock : (n,) array_like, optional
+        All frames, s; those of the motion by default.
+    good : (n,) array_like of bool, optional
+        Frames that `motion` has.
+    noise : HumanDynamicsNoise, optional
+    contacts : sequence of str
+        Links that may carry a wrench nobody measures.
+    points : mapping of str to (3,) array_like
+        Contact to the point in its link's frame about which its moment is as small as the noise's `contact_wrench` says; the origin by default.
     payload : sequence of str
-        Links that together hold an object, whose mass is estimated.
+        Contacts that together hold an object, whose mass is estimated.
+    method : {"joint", "two_tasks"}
+        One estimate of everything, or the unmeasured wrenches first and from the momentum alone (Tirupachuri 2021), and then all else with them.
+    constraints : sequence of DynamicsConstraint
+    hard_dynamics : bool
     """
 
     kind = "human_dynamics"
 
     def __init__(
         self,
-        problem: HumanDynamics,
-        clock: FloatArray,
-        good: BoolArray | None = None,
+        motion: LinkMotion,
+        sensors: Sequence[Sensor],
+        clock: ArrayLike | None = None,
+        good: ArrayLike | None = None,
+        *,
+        noise: HumanDynamicsNoise | None = None,
+        contacts: Sequence[str] = (),
+        points: Mapping[str, ArrayLike] | None = None,
         payload: Sequence[str] = (),
+        method: Literal["joint", "two_tasks"] = "joint",
+        constraints: Sequence[DynamicsConstraint] = (),
+        hard_dynamics: bool = False,
     ) -> None:
-        self.problem, self.clock, self.payload = problem, clock, tuple(payload)
-        self.good: BoolArray = np.ones(clock.size, dtype=bool) if good is None else good
-        if int(self.good.sum()) != len(problem):
-            raise InputError(
-                "good", f"{len(problem)} frames, those of the problem", f"{int(self.good.sum())}"
-            )
+        self.noise, self.contacts, self.payload = (
+            noise or HumanDynamicsNoise(),
+            tuple(contacts),
+            tuple(payload),
+        )
+        self.clock = motion.t if clock is None else np.asarray(clock, dtype=float)
+        self.good: BoolArray = (
+            np.ones(self.clock.size, dtype=bool) if good is None else np.asarray(good, dtype=bool)
+        )
+        if int(self.good.sum()) != len(motion):
+            raise InputError("good", f"{len(motion)} frames, those of the motion", f"{int(self.good.sum())}")
+        where = {link: np.asarray(point, dtype=float) for link, point in (points or {}).items()}
+        for name, links, known in (
+            ("contacts", self.contacts, motion.links), ("payload", self.payload, self.contacts), ("points", tuple(where), self.contacts),
+        ):  # fmt: skip
+            for link in links:
+                if link not in known:
+                    raise InputError(
+                        name,
+                        "links among " + (", ".join(known) or "none"),
+                        repr(link),
+                        close_matches(link, known),
+                    )
+        wrenches = [sensor for sensor in sensors if isinstance(sensor, ExternalWrench)]
+        self.momentum: ExternalWrenchesEstimate | None = None
+        if self.contacts:
+            for sensor in wrenches:
+                if sensor.link in self.contacts:
+                    raise InputError("contacts", "links without a wrench sensor", repr(sensor.link))
+            self.momentum = ExternalWrenches(motion, wrenches, self.contacts, self.noise).estimate()
+        every: list[Sensor] = list(sensors)
+        if self.contacts and method == "joint":
+            every.append(contact_rows(motion, self.noise, self.contacts, where))
+        elif self.contacts:
+            if where:
+                raise InputError("points", 'the method "joint"', repr(method))
+            assert self.momentum is not None
+            every = [sensor for sensor in sensors if not isinstance(sensor, ExternalWrench)]
+            every.append(self.momentum.as_sensor())
+        self.method = method
+        self.problem = HumanDynamics(motion, every, self.noise, (), constraints, hard_dynamics)
+        self._weighing = None if self.contacts else weigh(motion, wrenches)
 
     def solve(self, solver: str | None = None) -> HumanDynamicsResult:
         """Solve all frames; see :func:`factorgrasp.solvers.frames.solve_frames`."""
         from factorgrasp.solvers.frames import solve_frames
 
         payload = None
-        if self.payload:
-            frames, payload = solve_with_payload(self.problem, self.payload, solver)
+        if self.contacts and self.method == "joint":
+            frames, x, P = solve_with_contacts(self.problem, solver)
+            if self.payload:
+                payload = payload_of(self.problem.motion, self.noise, self.contacts, self.payload, x, P)
         else:
             frames = solve_frames(self.problem, solver)
+            if self.payload:
+                assert self.momentum is not None
+                found = self.momentum.payload(self.payload)
+                payload = Payload(found.links, found.mass, found.sd, found.mean, float(np.median(found.sd)))
+        motion = self.problem.motion
+        jointed = tuple(joint.name for joint in motion.joints if joint.dofs)
         return HumanDynamicsResult(
-            self._summary(frames),
-            frames,
-            self.clock,
-            self.good,
-            self.problem.motion.R,
-            tuple(joint.name for joint in self.problem.motion.joints if joint.dofs),
-            payload,
-            weigh(self.problem),
+            self._summary(frames), frames, self.clock, self.good, motion.R, jointed, payload, self._weighing
         )
 
     # ---- the middle frame, for the comparison of solvers ------------------------------------------------------
@@ -130,6 +196,7 @@ class HumanDynamicsTask:
             {},
             message,
             residuals=tuple(map(_agreement, frames.innovations)),
+            observability=None if self.momentum is None else self.momentum.observability(),
             iterations=len(frames),
             timing={"solve": frames.time},
             versions=versions(("pinocchio", "qdldl")),
@@ -206,7 +273,7 @@ class HumanDynamicsResult:
 
         frames, solved = self.frames, np.array([status.ok for status in self.frames.status])
         out = to_dict(self.estimate)
-        for key in ("variables", "observability", "certificate", "multipliers", "objective", "iterations"):
+        for key in ("variables", "certificate", "multipliers", "objective", "iterations"):
             out.pop(key)
         out["frames"] = {"all": self.t.size, "gaps": int((~self.good).sum()), "solved": int(solved.sum())}
         out["units"] = (
@@ -313,12 +380,10 @@ class HumanDynamicsResult:
         return out
 
 
-def weigh(problem: HumanDynamics) -> Weighing | None:
+def weigh(motion: LinkMotion, wrenches: Sequence[ExternalWrench]) -> Weighing | None:
     """The body's mass from the measured forces: ``m = F' a / a' a`` with ``a`` the proper acceleration of its centre of mass."""
-    wrenches = [sensor for sensor in problem.sensors if isinstance(sensor, ExternalWrench)]
-    if not wrenches or problem.system.contacts:
+    if not wrenches:
         return None
-    motion = problem.motion
     force = np.zeros((len(motion), 3))
     for sensor in wrenches:
         values = sensor.values[:, :3]

@@ -53,8 +53,8 @@ def rotation_cost(
 ) -> FloatArray:
     """``Q`` (10, 10) with ``x' Q x`` twice the cost at the best other unknowns, ``x = [vec R (columns), 1]``."""
     B_g, B_a = lifted_residuals(model, state)
-    G = np.einsum("imk,mn,inl->kl", B_g, Z_g, B_g, optimize=True) + np.einsum(
-        "imk,mn,inl->kl", B_a, Z_a, B_a, optimize=True
+    G = np.sum(B_g.transpose(0, 2, 1) @ Z_g @ B_g, axis=0) + np.sum(
+        B_a.transpose(0, 2, 1) @ Z_a @ B_a, axis=0
     )
     where = model.columns
     G[9:12, 9:12] += np.diag(precision[where["translation"]])

@@ -154,9 +154,9 @@ def estimated_variances(
         (L_g, J_g, Z_g, declared.gyro, w_g),
         (L_a, J_a, Z_a, declared.accelerometer, w_a),
     ):
-        power = np.einsum("ij,kjl,il->k", L, Z, L, optimize=True)
+        power = np.sum((L @ Z) * L, axis=(1, 2))
         spread = np.tensordot(half, J, axes=(0, 0)).reshape(-1, J.shape[2])
-        leverage = np.einsum("ij,kjl,il->k", spread, Z, spread, optimize=True) * weight
+        leverage = np.sum((spread @ Z) * spread, axis=(1, 2)) * weight
         free = np.maximum(3.0 * dof - leverage, 0.25 * 3.0 * dof)
         out.append((power + PRIOR_DOF * prior) / (free + PRIOR_DOF))
         powers.append(power)

@@ -244,7 +244,7 @@ def search_time_offset(
     InputError
         When the recordings do not overlap at any offset within reach.
     """
-    step = max(robot.step, 1.0 / max(8.0 * bandwidth, 40.0))
+    step = max(robot.step, 1.0 / max(4.0 * bandwidth, 40.0))
     grid = np.arange(robot.t[0], robot.t[-1], step)
     if grid.size < 16:
         raise InputError("robot", "a recording of at least 16 samples", f"{grid.size}")

@@ -9,7 +9,7 @@ through `linearize`, on gtsam's optimisers through its native graph, and segment
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -36,7 +36,7 @@ from factorgrasp.problems.grasp_segment_cut import (
     segment_moments,
     window_norms,
 )
-from factorgrasp.problems.grasp_segment_factor import SegmentFactor
+from factorgrasp.problems.grasp_segment_factor import Quadratic, SegmentFactor
 from factorgrasp.problems.grasp_segment_graph import Increment, SegmentGraph, SegmentKeys
 from factorgrasp.problems.grasp_system import (
     floored_inverse,
@@ -46,7 +46,7 @@ from factorgrasp.problems.grasp_system import (
     prior_residual,
 )
 from factorgrasp.problems.grasp_track import GraspTrack
-from factorgrasp.typing import BoolArray, FloatArray, IntArray, State
+from factorgrasp.typing import FloatArray, IntArray, State
 from factorgrasp.uncertainty import Covariance
 from factorgrasp.variables import Variable, retract, slices
 
@@ -177,9 +177,7 @@ class GraspSegments:
         """
         if self.static:
             return self.problem.linearize(state)
-        if self._pattern is None:
-            self._pattern = self._make_pattern()
-        system = self._pattern
+        system = self._fill_ties(state)
         rows = [factor.rows(self.local(state, k)) for k, factor in enumerate(self.factors)]
         A, b = np.stack([row[0] for row in rows]), np.stack([row[1] for row in rows])
         blocks: dict[str, FloatArray] = {
@@ -189,11 +187,6 @@ class GraspSegments:
             for name, part in zip(names, (slice(0, 3), slice(3, 6)), strict=True):
                 blocks[name] = A[k, :, part].ravel()
         system.set_term("moments", blocks, b.ravel())
-        self._fill_walk(system, state)
-        first = self.local(state, 0)
-        for variable in self.model.variables:
-            jacobian, value = prior_residual(variable, first, self.problem.prior)
-            system.set_term(f"prior of {variable.name}", {self._own_name(variable): jacobian}, -value)
         return system
 
     def retract(self, state: State, step: FloatArray) -> State:
@@ -232,12 +225,14 @@ class GraspSegments:
         """
         if self.static:
             return self.problem.score_covariance(state)
-        rows, ties, information, meat = self._information(state)
+        forms, tied = self._forms(state), self._tied(state)[0]
+        ties = tied.T @ tied
+        rows = self._summed(ties, [_gram(f.rows(self.factors[k].offset)[0]) for k, f in enumerate(forms)])
         if self.problem.clock.correlation < SMALLEST_CORRELATION:
             # Robot and hand are not seen to turn together: nothing of the grasp is known but priors and walk.
             return np.asarray(rows @ np.linalg.inv(ties) @ rows)
-        gain = rows @ floored_inverse(information)
-        return np.asarray(gain @ meat @ gain.T)
+        gain = rows @ floored_inverse(self._summed(ties, [form.matrix for form in forms]))
+        return np.asarray(gain @ self._meat(state) @ gain.T)
 
     def describe_direction(self, variable: Variable, vector: FloatArray) -> str:
         """Words for a direction of an unknown, with the time of its segment."""
@@ -315,14 +310,11 @@ class GraspSegments:
         Up to a constant that is the same for every width of the walk, static included, as long as cut, weights
         and clocks are the same: the width that makes it largest is the one that the data speak for.
         """
-        _, _, information, _ = self._information(state)
-        out = -0.5 * float(np.linalg.slogdet(information)[1])
-        for k, factor in enumerate(self.factors):
-            local = self.local(state, k)
-            out -= factor.quadratic(local).value + 0.5 * factor.slip_rate_evidence(local)
-        system = self.linearize(state)
-        residuals = system.residuals(np.zeros(system.size))[_tying_rows(system)]
-        out -= 0.5 * float(residuals @ residuals)
+        forms, (tied, residuals) = self._forms(state), self._tied(state)
+        information = self._summed(tied.T @ tied, [form.matrix for form in forms])
+        out = -0.5 * float(np.linalg.slogdet(information)[1]) - 0.5 * float(residuals @ residuals)
+        for k, (factor, form) in enumerate(zip(self.factors, forms, strict=True)):
+            out -= form.value + 0.5 * factor.slip_rate_evidence(self.local(state, k))
         if not self.static:
             steps = float(np.log(np.diff(self.t)).sum())
             width = float(np.log(self.rotation_walk_sd * self.translation_walk_sd))
@@ -373,9 +365,19 @@ class GraspSegments:
         covariance = Covariance.diagonal(np.repeat(sd**2 * steps, 3))
         return Term(name, 3 * steps.size, tuple(pattern), covariance, group=3, pattern=pattern, unit=unit)
 
+    def _fill_ties(self, state: State) -> LeastSquares:
+        """The system with the values of the walk and the priors filled in."""
+        if self._pattern is None:
+            self._pattern = self._make_pattern()
+        system, first = self._pattern, self.local(state, 0)
+        for variable in self.model.variables:
+            jacobian, value = prior_residual(variable, first, self.problem.prior)
+            system.set_term(f"prior of {variable.name}", {self._own_name(variable): jacobian}, -value)
+        if len(self.factors) > 1:
+            self._fill_walk(system, state)
+        return system
+
     def _fill_walk(self, system: LeastSquares, state: State) -> None:
-        if len(self.factors) < 2:
-            return
         R = np.stack([state[rotation] for rotation, _ in self._names])
         p = np.stack([state[translation] for _, translation in self._names])
         turn = np.matmul(R[:-1].transpose(0, 2, 1), R[1:])
@@ -400,19 +402,36 @@ class GraspSegments:
         shared = [every[where[v.name]] for v in self._shared]
         return [np.concatenate([every[where[a]], every[where[b]], *shared]) for a, b in self._names]
 
-    def _information(self, state: State) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Four dense (n, n): information of the rows, of walk and priors, of all as it is; score covariance."""
-        system = self.linearize(state)
-        matrix, _ = system.whitened()
-        rows = (matrix.T @ matrix).toarray()
-        tied = matrix[_tying_rows(system)]
-        ties = (tied.T @ tied).toarray()
-        information, meat = ties.copy(), ties.copy()
-        for k, columns in enumerate(self._columns()):
-            local, where = self.local(state, k), np.ix_(columns, columns)
-            information[where] += self.factors[k].quadratic(local).matrix
-            meat[where] += self.factors[k].score_covariance(local)
-        return rows, ties, information, meat
+    def _forms(self, state: State) -> list[Quadratic]:
+        return [factor.quadratic(self.local(state, k)) for k, factor in enumerate(self.factors)]
+
+    def _tied(self, state: State) -> tuple[FloatArray, FloatArray]:
+        """Whitened rows (m, n) and residuals (m,) of the walk and the priors."""
+        system = self.problem.linearize(state) if self.static else self._fill_ties(state)
+        ours = np.ones(system.jacobian.height, dtype=bool)
+        for name in ("moments", "gyroscope", "accelerometer"):
+            if name in system.terms:
+                ours[system.jacobian.slices[name]] = False
+        matrix, rhs = system.whitened()
+        return matrix[ours].toarray(), -rhs[ours]
+
+    def _summed(self, ties: FloatArray, parts: Sequence[FloatArray]) -> FloatArray:
+        """Dense (n, n) sum of `ties` and of one matrix a segment, on [rotation; translation; shared]."""
+        out = ties.copy()
+        for columns, part in zip(self._columns(), parts, strict=True):
+            out[np.ix_(columns, columns)] += part
+        return out
+
+    def _information(self, state: State) -> FloatArray:
+        """Curvature of the whole cost (n, n)."""
+        tied = self._tied(state)[0]
+        return self._summed(tied.T @ tied, [form.matrix for form in self._forms(state)])
+
+    def _meat(self, state: State) -> FloatArray:
+        """Covariance of the gradient of the whole cost (n, n)."""
+        tied = self._tied(state)[0]
+        parts = [factor.score_covariance(self.local(state, k)) for k, factor in enumerate(self.factors)]
+        return self._summed(tied.T @ tied, parts)
 
     def _again(self, problem: GraspPose, start: State | None) -> GraspSegments:
         out = copy.copy(self)
@@ -431,7 +450,7 @@ class GraspSegments:
         cut = self._shifted(state, shift) if moved else self
         state = cut._start if moved else state
         base = cut.problem
-        covariance = floored_inverse(cut._information(state)[2])
+        covariance = floored_inverse(cut._information(state))
         local = [cut.local(state, k) for k in range(len(cut.factors))]
         parts = [covariance[np.ix_(columns, columns)] for columns in cut._columns()]
         variances = band_variances(base, cut._label, cut.factors, local, parts)
@@ -454,7 +473,7 @@ class GraspSegments:
 
     def _moved(self, state: State) -> float:
         """Largest change of an unknown since the start, in standard deviations."""
-        sd = np.sqrt(np.diag(floored_inverse(self._information(state)[2])))
+        sd = np.sqrt(np.diag(floored_inverse(self._information(state))))
         step = np.concatenate([v.local(self._start[v.name], state[v.name]) for v in self.variables])
         return float(np.max(np.abs(step / sd)))
 
@@ -479,9 +498,8 @@ class GraspSegments:
         base = self.problem
         if base.settings.sensor_errors != "auto" or base._pruned:
             return None
-        _, _, information, meat = self._information(state)
-        bread = floored_inverse(information)
-        drop = insignificant(self.variables, state, bread @ meat @ bread)
+        bread = floored_inverse(self._information(state))
+        drop = insignificant(self.variables, state, bread @ self._meat(state) @ bread)
         if not drop:
             return None
         fresh = copy.copy(base)
@@ -490,13 +508,8 @@ class GraspSegments:
         return self._again(fresh, state)
 
 
-def _tying_rows(system: LeastSquares) -> BoolArray:
-    """Rows of the walk and the priors."""
-    out = np.ones(system.jacobian.height, dtype=bool)
-    for name in ("moments", "gyroscope", "accelerometer"):
-        if name in system.terms:
-            out[system.jacobian.slices[name]] = False
-    return out
+def _gram(A: FloatArray) -> FloatArray:
+    return np.asarray(A.T @ A)
 
 
 __all__ = ["MOST_SEGMENTS", "GraspSegments"]

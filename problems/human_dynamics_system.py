@@ -402,7 +402,9 @@ class HumanDynamicsSystem:
             for j in self.axes:
                 if tree.parents[j] == tree.root:
                     bias[:, j] += (k.transform[:, j] @ given[:, :, None])[..., 0]
-        return bias[:, list(self.axes)].reshape(count, -1), balance.reshape(count, -1)
+        if len(self.axes) < len(tree.joints):
+            bias = bias[:, list(self.axes)]
+        return bias.reshape(count, -1), balance.reshape(count, -1)
 
 
 def _rows(slices: Mapping[str, slice], names: Sequence[str]) -> slice:
@@ -414,23 +416,25 @@ def _rows(slices: Mapping[str, slice], names: Sequence[str]) -> slice:
 
 def _minus_axes(tree: BodyTree, joints: Sequence[int]) -> Writer:
     ends = np.cumsum([len(dofs) for dofs in tree.dofs])
-    columns, rows = [], []
+    chosen = []
     for j in joints:
         size = len(tree.dofs[j])
-        columns.append(np.tile(np.arange(ends[j] - size, ends[j]), 6))
-        rows.append(np.repeat(np.arange(6), size))
-    column, row = np.concatenate(columns), np.concatenate(rows)
-    return lambda k: -k.axes[:, column, row]
+        column, row = np.tile(np.arange(ends[j] - size, ends[j]), 6), np.repeat(np.arange(6), size)
+        chosen.append(6 * column + row)
+    index = np.concatenate(chosen)
+    return lambda k: np.negative(k.axes.reshape(k.count, -1).take(index, axis=1))
 
 
 def _minus_transform(joints: IntArray) -> Writer:
     rows, cols = np.nonzero(_MOTION)
-    return lambda k: -k.transform[:, joints][..., rows, cols].reshape(k.count, -1)
+    index = (36 * joints[:, None] + 6 * rows + cols).ravel()
+    return lambda k: np.negative(k.transform.reshape(k.count, -1).take(index, axis=1))
 
 
 def _transposed_transform(joints: IntArray) -> Writer:
     rows, cols = np.nonzero(_MOTION.T)
-    return lambda k: k.transform[:, joints][..., cols, rows].reshape(k.count, -1)
+    index = (36 * joints[:, None] + 6 * cols + rows).ravel()
+    return lambda k: k.transform.reshape(k.count, -1).take(index, axis=1)
 
 
 def _masked(make: Writer, pattern: BoolArray) -> Writer:

@@ -76,9 +76,11 @@ def spatial_inertia(mass: FloatArray, com: FloatArray, inertia: FloatArray) -> F
 
 def cross_force(v: FloatArray, f: FloatArray) -> FloatArray:
     """``v x* f = [w x f_lin; v_lin x f_lin + w x f_ang]`` for (..., 6)."""
-    linear, angular = v[..., :3], v[..., 3:]
-    force, moment = f[..., :3], f[..., 3:]
-    return np.concatenate([cross(angular, force), cross(linear, force) + cross(angular, moment)], axis=-1)
+    out = np.empty(np.broadcast_shapes(v.shape, f.shape))
+    turned = cross(v[..., None, 3:], f.reshape(*f.shape[:-1], 2, 3))
+    out[..., :3] = turned[..., 0, :]
+    out[..., 3:] = turned[..., 1, :] + cross(v[..., :3], f[..., :3])
+    return out
 
 
 def cross_motion(v: FloatArray, m: FloatArray) -> FloatArray:

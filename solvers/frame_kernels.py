@@ -52,15 +52,15 @@ def _solver(lanes: int) -> Any:
     ) -> None:
         frames, number = entries.shape
         height, size, below = rhs.shape[1], place.size, factor_rows.size
-        a = np.empty((number, lanes))
-        b = np.empty((height, lanes))
-        r = np.empty((height, lanes))
-        L = np.empty((below + size, lanes))
-        Z = np.empty((below + size, lanes))
-        diagonal = np.empty((size, lanes))
-        x = np.empty((size, lanes))
-        g = np.empty((size, lanes))
-        sums = np.empty((size, lanes))
+        a = np.empty((number) * lanes)
+        b = np.empty((height) * lanes)
+        r = np.empty((height) * lanes)
+        L = np.empty((below + size) * lanes)
+        Z = np.empty((below + size) * lanes)
+        diagonal = np.empty((size) * lanes)
+        x = np.empty((size) * lanes)
+        g = np.empty((size) * lanes)
+        sums = np.empty((size) * lanes)
         inverse = np.empty(lanes)
         total = np.empty(lanes)
         energy = np.empty(lanes)
@@ -71,9 +71,9 @@ def _solver(lanes: int) -> Any:
             for w in range(lanes):
                 frame = min(first + w, frames - 1)
                 for e in range(number):
-                    a[e, w] = entries[frame, e]
+                    a[e * lanes + w] = entries[frame, e]
                 for i in range(height):
-                    b[i, w] = rhs[frame, i]
+                    b[i * lanes + w] = rhs[frame, i]
             # ---- normal equations, in factor order
             L[:] = 0.0
             pair = 0
@@ -83,36 +83,36 @@ def _solver(lanes: int) -> Any:
                         t = gram_target[pair]
                         pair += 1
                         for w in range(lanes):
-                            L[t, w] += a[e, w] * a[f, w]
+                            L[t * lanes + w] += a[e * lanes + w] * a[f * lanes + w]
             for j in range(size):
                 for w in range(lanes):
-                    diagonal[j, w] = L[below + j, w]
+                    diagonal[j * lanes + w] = L[(below + j) * lanes + w]
             # ---- L D L'
             for w in range(lanes):
                 state[w] = 0.0
             for j in range(size):
                 for w in range(lanes):
-                    pivot = L[below + j, w]
-                    if not pivot > 1e-15 * diagonal[j, w]:
+                    pivot = L[(below + j) * lanes + w]
+                    if not pivot > 1e-15 * diagonal[j * lanes + w]:
                         state[w] = 1.0
-                        pivot = max(diagonal[j, w], 1e-300)
-                        L[below + j, w] = pivot
+                        pivot = max(diagonal[j * lanes + w], 1e-300)
+                        L[(below + j) * lanes + w] = pivot
                     inverse[w] = 1.0 / pivot
                 pair = update_start[j]
                 for p in range(factor_indptr[j], factor_indptr[j + 1]):
                     for w in range(lanes):
-                        total[w] = L[p, w] * inverse[w]
+                        total[w] = L[p * lanes + w] * inverse[w]
                     for q in range(factor_indptr[j], p):
                         t = update_target[pair]
                         pair += 1
                         # Entries before p are scaled already: L D of them is what the update takes.
                         for w in range(lanes):
-                            L[t, w] -= L[p, w] * L[q, w]
+                            L[t * lanes + w] -= L[p * lanes + w] * L[q * lanes + w]
                     t = update_target[pair]
                     pair += 1
                     for w in range(lanes):
-                        L[t, w] -= L[p, w] * total[w]
-                        L[p, w] = total[w]
+                        L[t * lanes + w] -= L[p * lanes + w] * total[w]
+                        L[p * lanes + w] = total[w]
             # ---- solve and refine through A
             x[:] = 0.0
             for w in range(lanes):
@@ -120,8 +120,8 @@ def _solver(lanes: int) -> Any:
                 before[w] = np.inf
             for i in range(height):
                 for w in range(lanes):
-                    total[w] += b[i, w] * b[i, w]
-                    r[i, w] = b[i, w]
+                    total[w] += b[i * lanes + w] * b[i * lanes + w]
+                    r[i * lanes + w] = b[i * lanes + w]
             for w in range(lanes):
                 floor[w] = max(1e-9, 1e-14 * np.sqrt(total[w]))
             for step in range(most_refinements + 1):
@@ -130,19 +130,19 @@ def _solver(lanes: int) -> Any:
                     for e in range(indptr[i], indptr[i + 1]):
                         t = place[indices[e]]
                         for w in range(lanes):
-                            g[t, w] += a[e, w] * r[i, w]
+                            g[t * lanes + w] += a[e * lanes + w] * r[i * lanes + w]
                 for j in range(size):
                     for p in range(factor_indptr[j], factor_indptr[j + 1]):
                         t = factor_rows[p]
                         for w in range(lanes):
-                            g[t, w] -= L[p, w] * g[j, w]
+                            g[t * lanes + w] -= L[p * lanes + w] * g[j * lanes + w]
                 for j in range(size - 1, -1, -1):
                     for w in range(lanes):
-                        g[j, w] /= L[below + j, w]
+                        g[j * lanes + w] /= L[(below + j) * lanes + w]
                     for p in range(factor_indptr[j], factor_indptr[j + 1]):
                         t = factor_rows[p]
                         for w in range(lanes):
-                            g[j, w] -= L[p, w] * g[t, w]
+                            g[j * lanes + w] -= L[p * lanes + w] * g[t * lanes + w]
                 for w in range(lanes):
                     energy[w] = 0.0
                 for i in range(height):
@@ -151,13 +151,13 @@ def _solver(lanes: int) -> Any:
                     for e in range(indptr[i], indptr[i + 1]):
                         t = place[indices[e]]
                         for w in range(lanes):
-                            total[w] += a[e, w] * g[t, w]
+                            total[w] += a[e * lanes + w] * g[t * lanes + w]
                     for w in range(lanes):
-                        r[i, w] -= total[w]
+                        r[i * lanes + w] -= total[w]
                         energy[w] += total[w] * total[w]
                 for j in range(size):
                     for w in range(lanes):
-                        x[j, w] += g[j, w]
+                        x[j * lanes + w] += g[j * lanes + w]
                 settled = step > 0
                 for w in range(lanes):
                     energy[w] = np.sqrt(energy[w])
@@ -172,7 +172,7 @@ def _solver(lanes: int) -> Any:
             for w in range(lanes):
                 if first + w < frames:
                     for j in range(size):
-                        x_out[first + w, j] = x[place[j], w]
+                        x_out[first + w, j] = x[place[j] * lanes + w]
                     info[first + w, 0] = state[w]
             if not covariance:
                 continue
@@ -181,35 +181,35 @@ def _solver(lanes: int) -> Any:
                 start, stop = factor_indptr[j], factor_indptr[j + 1]
                 for p in range(start, stop):
                     for w in range(lanes):
-                        sums[p - start, w] = 0.0
+                        sums[(p - start) * lanes + w] = 0.0
                 pair = update_start[j]
                 for p in range(start, stop):
                     for q in range(start, p):
                         t = update_target[pair]
                         pair += 1
                         for w in range(lanes):
-                            sums[p - start, w] += Z[t, w] * L[q, w]
-                            sums[q - start, w] += Z[t, w] * L[p, w]
+                            sums[(p - start) * lanes + w] += Z[t * lanes + w] * L[q * lanes + w]
+                            sums[(q - start) * lanes + w] += Z[t * lanes + w] * L[p * lanes + w]
                     t = update_target[pair]
                     pair += 1
                     for w in range(lanes):
-                        sums[p - start, w] += Z[t, w] * L[p, w]
+                        sums[(p - start) * lanes + w] += Z[t * lanes + w] * L[p * lanes + w]
                 for w in range(lanes):
-                    total[w] = 1.0 / L[below + j, w]
+                    total[w] = 1.0 / L[(below + j) * lanes + w]
                 for p in range(start, stop):
                     for w in range(lanes):
-                        Z[p, w] = -sums[p - start, w]
-                        total[w] += L[p, w] * sums[p - start, w]
+                        Z[p * lanes + w] = -sums[(p - start) * lanes + w]
+                        total[w] += L[p * lanes + w] * sums[(p - start) * lanes + w]
                 for w in range(lanes):
-                    Z[below + j, w] = total[w]
+                    Z[(below + j) * lanes + w] = total[w]
             for w in range(lanes):
                 if first + w < frames:
                     spread = 0.0
                     for j in range(size):
-                        variance_out[first + w, j] = Z[below + place[j], w]
-                        spread += Z[below + j, w] * diagonal[j, w]
+                        variance_out[first + w, j] = Z[(below + place[j]) * lanes + w]
+                        spread += Z[(below + j) * lanes + w] * diagonal[j * lanes + w]
                     info[first + w, 1] = spread
                     for k in range(pair_place.size):
-                        pair_out[first + w, k] = Z[pair_place[k], w]
+                        pair_out[first + w, k] = Z[pair_place[k] * lanes + w]
 
     return solve_frames

@@ -158,12 +158,12 @@ class FrameSolver:
             doubtful = np.arange(count)
         else:
             self._plan.run(entries, rhs, covariance, x, variances, pairs, info)
-            bad = (info[:, 0] > 0.0) | ~np.isfinite(x.sum(axis=1)) | (info[:, 1] > TOO_WEAK)
+            bad = (info[:, 0] > 0.0) | ~np.isfinite(x.sum(axis=1)) | ~(info[:, 1] <= TOO_WEAK)
             doubtful = np.flatnonzero(bad)
-        splits = np.cumsum(widths)[:-1]
+        ends = np.cumsum(widths)
         blocks = tuple(
-            part.reshape(count, group.size, group.size)
-            for part, group in zip(np.split(pairs, splits, axis=1), self.marginals, strict=True)
+            pairs[:, end - width : end].reshape(count, group.size, group.size)
+            for end, width, group in zip(ends, widths, self.marginals, strict=True)
         ) if covariance else ()  # fmt: skip
         status, messages = [Status.SOLVED] * count, {}
         for f in doubtful:

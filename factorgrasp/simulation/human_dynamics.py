@@ -18,6 +18,7 @@ from factorgrasp.models.anthropometry import ANKLE_HEIGHT, Sex
 from factorgrasp.models.human import HumanBody, human_body
 from factorgrasp.models.joint_motion import differentiate_configurations
 from factorgrasp.problems.human_dynamics_sensors import Accelerometer, ExternalWrench, Sensor, plate_wrench
+from factorgrasp.problems.human_dynamics_settings import HumanDynamicsNoise
 from factorgrasp.problems.link_motion import LinkMotion
 from factorgrasp.problems.link_motion_pinocchio import PinocchioTree
 from factorgrasp.problems.link_motion_spatial import rotate_back
@@ -167,13 +168,18 @@ class HumanRecording:
         return np.array([pin.integrate(self.truth.model, row, d) for row, d in zip(q, step, strict=True)])
 
     @cached_property
-    def measured_motion(self) -> tuple[LinkMotion, BoolArray, float]:
-        """The motion from noisy motion capture, differentiated; which frames (n,) it has; variance of a joint acceleration."""
+    def measured_motion(self) -> tuple[LinkMotion, BoolArray, HumanDynamicsNoise]:
+        """The motion from noisy motion capture, differentiated; which frames (n,) it has; the noise of its accelerations."""
         model = self.body.model()
         found = differentiate_configurations(model, self.configurations, 1.0 / RATE, self.noise.bandwidth)
         keep = found.good
         motion = PinocchioTree(model).motion(self.t[keep], found.q[keep], found.qd[keep], found.qdd[keep])
-        return motion, keep, self.noise.angle**2 * found.acceleration_gain
+        n, gain = self.noise, found.acceleration_gain
+        root = [n.position**2 * gain] * 3 + [n.orientation**2 * gain] * 3
+        variances = HumanDynamicsNoise(
+            joint_acceleration=max(n.angle**2 * gain, 1e-12), link_acceleration=np.maximum(root, 1e-12)
+        )
+        return motion, keep, variances
 
     @cached_property
     def plates(self) -> dict[str, ForceRecording]:
@@ -224,11 +230,18 @@ class HumanRecording:
         for link in links:
             motion = self.truth.motion
             i, at = motion.link(link), self.body.segments[link].com
-            w, dw = (rotate_back(motion.R[:, i], x[:, i]) for x in (motion.angular_velocity, motion.angular_acceleration))
+            w, dw = (
+                rotate_back(motion.R[:, i], x[:, i])
+                for x in (motion.angular_velocity, motion.angular_acceleration)
+            )
             f = rotate_back(motion.R[:, i], motion.acceleration[:, i] - motion.gravity)
             f = f + np.cross(dw, at) + np.cross(w, np.cross(w, at))
             values = f + self.noise.accelerometer * rng.normal(size=f.shape)
-            out.append(Accelerometer(values[keep], self.noise.accelerometer**2, f"accelerometer on {link}", link=link, p_l_s=at))
+            out.append(
+                Accelerometer(
+                    values[keep], self.noise.accelerometer**2, f"accelerometer on {link}", link=link, p_l_s=at
+                )
+            )
         return out
 
 
@@ -270,7 +283,13 @@ def human_bowing(
     # Arms from hanging down to reaching forward.
     angles |= {name: value * (1.0 - bow) for name, value in _N_POSE.items()}
     angles |= {"jRightShoulder_z": 0.4 * np.pi * bow, "jLeftShoulder_z": -0.4 * np.pi * bow}
-    for joint, degrees in (("jL5S1", 12.0), ("jL4L3", 12.0), ("jL1T12", 10.0), ("jT9T8", 6.0), ("jT1C7", 5.0)):
+    for joint, degrees in (
+        ("jL5S1", 12.0),
+        ("jL4L3", 12.0),
+        ("jL1T12", 10.0),
+        ("jT9T8", 6.0),
+        ("jT1C7", 5.0),
+    ):
         angles[f"{joint}_y"] = np.radians(degrees) * bow
     plan = _standing_plan(body, knots, angles, pitch=np.radians(25.0) * bow)
     t = _samples(duration)
@@ -344,7 +363,10 @@ def human_carrying(
     elif motion == "one_foot":
         duration = 14.0
         lift = {"Right": (2.0, 5.5), "Left": (8.5, 12.0)}
-        lean = (np.array([0.0, 0.5, 2.0, 5.5, 8.5, 12.0, 13.5]), side * np.array([0.0, 0.0, 1.0, 1.0, -1.0, -1.0, 0.0]))
+        lean = (
+            np.array([0.0, 0.5, 2.0, 5.5, 8.5, 12.0, 13.5]),
+            side * np.array([0.0, 0.0, 1.0, 1.0, -1.0, -1.0, 0.0]),
+        )
         phases = {"left foot": (2.8, 4.7), "right foot": (9.3, 11.2)}
     else:
         raise InputError("motion", "'standing', 'one_foot' or 'walking'", repr(motion))
@@ -354,10 +376,14 @@ def human_carrying(
     angles = {name: np.full(knots.size, value) for name, value in _CARRY.items()}
     angles["jRightElbow_z"], angles["jLeftElbow_z"] = MOST_ANGLE + sway, -MOST_ANGLE - sway
     plan = _standing_plan(body, knots, angles, lean=lean, lift=lift)
-    return _record(f"human_carrying {motion}", body, body, plan, _samples(duration), noise, seed, phases, held=held)
+    return _record(
+        f"human_carrying {motion}", body, body, plan, _samples(duration), noise, seed, phases, held=held
+    )
 
 
-def _walking(body: HumanBody, held: Mapping[str, float], noise: HumanNoise | None, seed: int) -> HumanRecording:
+def _walking(
+    body: HumanBody, held: Mapping[str, float], noise: HumanNoise | None, seed: int
+) -> HumanRecording:
     """Eight short steps: centre of mass with the speed of a minimum-jerk move, feet where it will be above them."""
     step_time, double, steps = 0.9, 0.3, 8
     begin, way = 1.5, 1.4
@@ -377,7 +403,9 @@ def _walking(body: HumanBody, held: Mapping[str, float], noise: HumanNoise | Non
         start = begin + k * step_time + 0.5 * double
         land = start + step_time - double
         # Where the centre of mass will be in the middle of this foot's time on the ground.
-        target = way if k >= steps - 2 else float(np.interp(land + 0.5 * (step_time + double), knots, forward))
+        target = (
+            way if k >= steps - 2 else float(np.interp(land + 0.5 * (step_time + double), knots, forward))
+        )
         move = ease(knots, np.array([start, land]), np.array([at[swing], target]))
         inside = (knots >= start) & (knots <= land)
         after = knots > land
@@ -401,7 +429,9 @@ def _walking(body: HumanBody, held: Mapping[str, float], noise: HumanNoise | Non
     high = np.full(knots.size, hip_height(body) - 0.08)
     plan = Plan(knots, com, high, np.zeros(knots.size), feet, angles)
     phases = {"standing": (0.2, begin - 1.0), "walking": (begin, stop)}
-    return _record("human_carrying walking", body, body, plan, t, noise, seed, phases, held=held, right_load=load)
+    return _record(
+        "human_carrying walking", body, body, plan, t, noise, seed, phases, held=held, right_load=load
+    )
 
 
 def _knots(duration: float) -> FloatArray:
@@ -423,7 +453,9 @@ def _standing_plan(
     """Feet in place (or lifted for a while), the centre of mass over the middle of the feet or as `lean` moves it to the side."""
     feet = {side: np.tile(p, (knots.size, 1)) for side, p in standing_ankles(body).items()}
     for side, (start, end) in (lift or {}).items():
-        feet[side][:, 2] += ease(knots, np.array([start, start + 0.8, end - 0.8, end]), 0.12 * np.array([0.0, 1.0, 1.0, 0.0]))
+        feet[side][:, 2] += ease(
+            knots, np.array([start, start + 0.8, end - 0.8, end]), 0.12 * np.array([0.0, 1.0, 1.0, 0.0])
+        )
     com = np.zeros((knots.size, 2))
     com[:, 0] = 0.04
     if lean is not None:
@@ -457,8 +489,12 @@ def _record(
     external = {link: _weight(motion, link, mass, body.segments[link].com) for link, mass in held.items()}
     for link, force in (world_forces or {}).items():
         local = rotate_back(motion.R[:, motion.link(link)], force)
-        external[link] = np.concatenate([local, np.cross(np.broadcast_to(body.ends[link], local.shape), local)], axis=1)
-    torque, feet = _inverse_dynamics(model, trajectory, motion, external, right_load, ANKLE_HEIGHT * body.height)
+        external[link] = np.concatenate(
+            [local, np.cross(np.broadcast_to(body.ends[link], local.shape), local)], axis=1
+        )
+    torque, feet = _inverse_dynamics(
+        model, trajectory, motion, external, right_load, ANKLE_HEIGHT * body.height
+    )
     names = tuple(str(n) for n in list(model.names)[2:])
     truth = HumanTruth(trajectory, model, torque, names, {**external, **feet}, motion, sum(held.values()))
     return HumanRecording(name, body, truth, noise or HumanNoise(), seed, phases)

