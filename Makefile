@@ -21,7 +21,7 @@ export OMP_NUM_THREADS ?= 1
 unexport PYTHONPATH PYTHONHOME VIRTUAL_ENV
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint types check format dist clean
+.PHONY: help demo test lint types check figures format dist clean
 
 help:  ## Say what can be made.
 	@echo "factorgrasp: what can be made"
@@ -46,6 +46,10 @@ types: $(DEV)  ## Check types (mypy --strict).
 	$(BIN)/mypy --strict -p factorgrasp
 
 check: lint types test  ## All of the three above.
+
+figures: $(RUNTIME)  ## Draw the figures of docs/ afresh.
+	@echo "== figures: docs/make_figures.py"
+	$(BIN)/python docs/make_figures.py
 
 format: $(DEV)  ## Mend style and formatting where ruff can.
 	$(BIN)/ruff check --fix .

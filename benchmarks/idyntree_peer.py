@@ -1,6 +1,7 @@
-"""The peer: iDynTree's C++ maximum a posteriori estimator (``BerdySparseMAPSolver``) on the body, sensors and covariances that we are given.
+"""The peer: iDynTree's C++ estimator ``BerdySparseMAPSolver`` on the body, sensors and covariances that we are given.
 
-Floating-base variant. Unknowns and rows are those of mathematics 4.1 with one-degree-of-freedom joints; the order of unknowns is iDynTree's own.
+Floating-base variants. Unknowns and rows are those of mathematics 4.1 with one-degree-of-freedom joints; the order of unknowns is
+iDynTree's own.
 """
 
 from __future__ import annotations
@@ -48,7 +49,11 @@ class IDynTreePeer:
 
         self.idt, self.covariances = idt, covariances
         loader = idt.ModelLoader()
-        ok = loader.loadModelFromString(urdf) if joints is None else loader.loadReducedModelFromString(urdf, joints)
+        ok = (
+            loader.loadModelFromString(urdf)
+            if joints is None
+            else loader.loadReducedModelFromString(urdf, joints)
+        )
         if not ok:
             raise RuntimeError("iDynTree cannot read the URDF")
         self.model = loader.model().copy()
@@ -60,7 +65,9 @@ class IDynTreePeer:
             sensor.setParentLink(link)
             sensor.setParentLinkIndex(self.model.getLinkIndex(link))
             sensor.setLinkSensorTransform(
-                idt.Transform(idt.Rotation.FromPython(np.asarray(R).tolist()), idt.Position(*[float(v) for v in p]))
+                idt.Transform(
+                    idt.Rotation.FromPython(np.asarray(R).tolist()), idt.Position(*[float(v) for v in p])
+                )
             )
             sensors.addSensor(sensor)
         options = idt.BerdyOptions()
@@ -105,15 +112,25 @@ class IDynTreePeer:
             if kind == "wrench":
                 variance[where] = (c.wrenches or {}).get(sensor.id, c.wrench_default)
             else:
-                variance[where] = {"joint": c.joint_acceleration, "accelerometer": c.accelerometer}.get(kind, c.momentum_rate)
+                variance[where] = {"joint": c.joint_acceleration, "accelerometer": c.accelerometer}.get(
+                    kind, c.momentum_rate
+                )
         self.sensor_variance = variance
         if self.rows:
             self.solver.setDynamicsConstraintsPriorCovariance(self._diagonal(np.full(self.rows, c.model)))
         self.solver.setDynamicsRegularizationPriorCovariance(self._diagonal(np.full(self.size, c.prior)))
-        self.solver.setDynamicsRegularizationPriorExpectedValue(self.idt.VectorDynSize.FromPython([0.0] * self.size))
+        self.solver.setDynamicsRegularizationPriorExpectedValue(
+            self.idt.VectorDynSize.FromPython([0.0] * self.size)
+        )
         self.solver.setMeasurementsPriorCovariance(self._diagonal(variance))
 
-    def measurement(self, wrenches: dict[str, np.ndarray], qdd: dict[str, float], specific: dict[str, np.ndarray], momentum: np.ndarray | None = None) -> np.ndarray:
+    def measurement(
+        self,
+        wrenches: dict[str, np.ndarray],
+        qdd: dict[str, float],
+        specific: dict[str, np.ndarray],
+        momentum: np.ndarray | None = None,
+    ) -> np.ndarray:
         """The vector y in iDynTree's order."""
         y = np.zeros(self.measured)
         for (kind, name), where in self.ranges.items():
@@ -127,7 +144,9 @@ class IDynTreePeer:
                 y[where] = momentum
         return y
 
-    def estimate(self, q: np.ndarray, qd: np.ndarray, base_rate: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, float]:
+    def estimate(
+        self, q: np.ndarray, qd: np.ndarray, base_rate: np.ndarray, y: np.ndarray
+    ) -> tuple[np.ndarray, float]:
         """Unknowns d in iDynTree's order and the seconds spent in iDynTree."""
         idt = self.idt
         jq, jv = idt.JointPosDoubleArray(self.model), idt.JointDOFsDoubleArray(self.model)

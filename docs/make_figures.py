@@ -145,6 +145,8 @@ def main(arguments: list[str] | None = None) -> None:
         part = next(prefixes[motion] for motion in MOTIONS if motion in recording.name)
         return part.t, part.rotation_wxyz, part.translation, part.covariance
 
+    found = solve(GraspPose(recordings["exciting"].robot, recordings["exciting"].hand))
+    found.plot(chosen.out / "grasp.png")
     data = reproduce_fig4(seed=chosen.seed, extra_curves={LABEL: history})
     draw_fig4(data, chosen.out / "grasp_fig4.png")
     draw_observability(prefixes, recordings, chosen.out / "grasp_observability.png")

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -100,11 +100,12 @@ def _noise(covariance: Mapping[str, Any], body: BodyMotion) -> HumanDynamicsNois
     preset = get(
         covariance, "preset", Literal["default", "latella2018", "tirupachuri2021"], "[covariance]", "default"
     )
-    noise = {
+    presets: dict[str, Callable[[], HumanDynamicsNoise]] = {
         "default": HumanDynamicsNoise,
         "latella2018": HumanDynamicsNoise.latella2018,
         "tirupachuri2021": HumanDynamicsNoise.tirupachuri2021,
-    }[preset]()
+    }
+    noise = presets[preset]()
     # What follows from the motion goes before a preset, what is stated here before both.
     stated: dict[str, PerName] = dict(body.variances)
     for key in _NOISE:

@@ -44,8 +44,8 @@ class BodyMotion:
     motion : LinkMotion
         Of the good frames.
     variances : dict
-        `joint_acceleration` and `link_acceleration` of :class:`HumanDynamicsNoise`, as far as they follow from the stated noise of angles and
-        pose through the filter that differentiated them.
+        `joint_acceleration` and `link_acceleration` of :class:`HumanDynamicsNoise`, as far as they follow from the stated noise of angles
+        and pose through the filter that differentiated them.
     """
 
     clock: FloatArray

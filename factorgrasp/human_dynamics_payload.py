@@ -14,8 +14,8 @@ from factorgrasp.problems.human_dynamics_estimate import HumanDynamicsEstimate
 from factorgrasp.problems.human_dynamics_sensors import WrenchSet
 from factorgrasp.problems.human_dynamics_settings import HumanDynamicsNoise, resolve
 from factorgrasp.problems.link_motion import LinkMotion
-from factorgrasp.problems.link_motion_spatial import skew
-from factorgrasp.typing import FloatArray, IntArray
+from factorgrasp.problems.link_motion_spatial import rotate, skew
+from factorgrasp.typing import BoolArray, FloatArray, IntArray
 
 CONTACTS = "unmeasured contacts"
 
@@ -52,8 +52,8 @@ def contact_rows(
 ) -> WrenchSet:
     """The zeros that stand for unmeasured wrenches, as one measurement of all of them, so that their joint covariance comes out.
 
-    The variances (`contact_wrench` of the noise) are those of force and moment at a contact's point, which is the link's origin unless `points`
-    says otherwise: a hand that holds something at its middle exerts a moment about the wrist.
+    The variances (`contact_wrench` of the noise) are those of force and moment at a contact's point, which is the link's origin unless
+    `points` says otherwise: a hand that holds something at its middle exerts a moment about the wrist.
     """
     loose = resolve(noise.contact_wrench, motion.links, [6] * len(motion.links), "contact_wrench")
     covariance = np.zeros((6 * len(links), 6 * len(links)))
@@ -131,6 +131,7 @@ def payload_of(
     links: tuple[str, ...],
     x: FloatArray,
     P: FloatArray,
+    points: Mapping[str, FloatArray] | None = None,
 ) -> Payload:
     """The mass of the one object that some of the contacts hold.
 
@@ -142,13 +143,16 @@ def payload_of(
         All contacts, and those that hold the object.
     x, P : ndarray
         (n, 6 k) and (n, 6 k, 6 k), of all contacts.
+    points : mapping of str to (3,) ndarray, optional
+        Where in the link's frame the object is held; the origin by default.
 
     Notes
     -----
     On hands with the acceleration a, an object of mass m pulls with ``F = m (g - a)``. The posterior of F, the sum of the hands' forces,
     holds a zero-mean prior (the noise's `contact_wrench` and `prior_external_wrench`), which draws masses towards zero. It is taken out:
-    with the posterior ``N(mu, P)`` and the prior ``N(0, P0)`` the data alone say ``m = u' P^-1 mu / u' (P^-1 - P0^-1) u``, ``u = g - a``,
-    with one over the denominator as variance. Errors of different hands go with each other; their joint covariance is used.
+    with the posterior ``N(mu, P)`` and the prior ``N(0, P0)`` the data alone say ``F = (P^-1 - P0^-1)^-1 P^-1 mu``, and ``m = F' u / u' u``
+    with ``u = g - a``. Weighting the components of F by their covariance would use them better if u were exact; with the noise of a, the
+    well-known horizontal ones bias the mass by several per cent. Errors of different hands go with each other: their joint covariance is used.
     """
     at = [motion.link(link) for link in links]
     R = motion.R[:, at]
@@ -165,15 +169,21 @@ def payload_of(
         prior += R[:, k] @ (variance[:, None] * np.swapaxes(R[:, k], 1, 2))
     force = (read @ x[:, :, None])[..., 0]
     covariance = read @ P @ np.swapaxes(read, 1, 2)
-    u = motion.gravity - motion.acceleration[:, at].mean(axis=1)
-    good = np.isfinite(covariance).all(axis=(1, 2))
+    arm = rotate(R, np.array([(points or {}).get(link, np.zeros(3)) for link in links]))
+    w = motion.angular_velocity[:, at]
+    felt = motion.acceleration[:, at] + np.cross(motion.angular_acceleration[:, at], arm) + np.cross(w, np.cross(w, arm))
+    u = motion.gravity - felt.mean(axis=1)
+    good: BoolArray = np.asarray(np.isfinite(covariance).all(axis=(1, 2)))
     posterior = np.linalg.inv(np.where(good[:, None, None], covariance, np.eye(3)))
-    information = np.einsum("ni,nij,nj->n", u, posterior - np.linalg.inv(prior), u)
-    known = good & (information > 0.0)
-    safe = np.where(known, information, 1.0)
-    mass = np.where(known, np.einsum("ni,nij,nj->n", u, posterior, force) / safe, np.nan)
-    sd = np.where(known, 1.0 / np.sqrt(safe), np.nan)
+    data = posterior - np.linalg.inv(prior)
+    known: BoolArray = good & np.asarray(np.linalg.eigvalsh(data)[:, 0] > 1e-9 * np.linalg.eigvalsh(posterior)[:, 2])
+    spread = np.linalg.inv(np.where(known[:, None, None], data, np.eye(3)))
+    h = u / np.sum(u**2, axis=1, keepdims=True)
+    mass = np.einsum("ni,nij,njk,nk->n", h, spread, posterior, np.where(known[:, None], force, np.nan))
+    variance = np.where(known, np.einsum("ni,nij,nj->n", h, spread, h), np.nan)
+    sd = np.sqrt(variance)
     if not known.any():
         return Payload(links, mass, sd, float("nan"), float("nan"))
-    mean = float(np.sum(safe[known] * mass[known]) / safe[known].sum())
+    weight = 1.0 / variance[known]
+    mean = float(np.sum(weight * mass[known]) / weight.sum())
     return Payload(links, mass, sd, mean, float(np.nanmedian(sd)))

@@ -81,11 +81,13 @@ class HumanDynamicsTask:
     contacts : sequence of str
         Links that may carry a wrench nobody measures.
     points : mapping of str to (3,) array_like
-        Contact to the point in its link's frame about which its moment is as small as the noise's `contact_wrench` says; the origin by default.
+        Contact to the point in its link's frame about which its moment is as small as the noise's `contact_wrench` says; by default
+        the origin.
     payload : sequence of str
         Contacts that together hold an object, whose mass is estimated.
     method : {"joint", "two_tasks"}
-        One estimate of everything, or the unmeasured wrenches first and from the momentum alone (Tirupachuri 2021), and then all else with them.
+        One estimate of everything, or the unmeasured wrenches first, from the momentum alone (Tirupachuri 2021), and then all else
+        with them.
     constraints : sequence of DynamicsConstraint
     hard_dynamics : bool
     """
@@ -146,7 +148,7 @@ class HumanDynamicsTask:
             assert self.momentum is not None
             every = [sensor for sensor in sensors if not isinstance(sensor, ExternalWrench)]
             every.append(self.momentum.as_sensor())
-        self.method = method
+        self.method, self._points = method, where
         self.problem = HumanDynamics(motion, every, self.noise, (), constraints, hard_dynamics)
         self._weighing = None if self.contacts else weigh(motion, wrenches)
 
@@ -158,7 +160,7 @@ class HumanDynamicsTask:
         if self.contacts and self.method == "joint":
             frames, x, P = solve_with_contacts(self.problem, solver)
             if self.payload:
-                payload = payload_of(self.problem.motion, self.noise, self.contacts, self.payload, x, P)
+                payload = payload_of(self.problem.motion, self.noise, self.contacts, self.payload, x, P, self._points)
         else:
             frames = solve_frames(self.problem, solver)
             if self.payload:

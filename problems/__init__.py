@@ -9,14 +9,39 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from factorgrasp.problems.external_wrenches import ExternalWrenches
+    from factorgrasp.problems.external_wrenches_estimate import ExternalWrenchesEstimate
     from factorgrasp.problems.grasp_estimate import GraspPoseEstimate
     from factorgrasp.problems.grasp_from_poses import GraspPoseFromPoses
     from factorgrasp.problems.grasp_from_poses_estimate import GraspFromPosesEstimate
     from factorgrasp.problems.grasp_from_poses_settings import GraspFromPosesNoise, GraspFromPosesSettings
     from factorgrasp.problems.grasp_pose import GraspPose
     from factorgrasp.problems.grasp_settings import GraspNoise, GraspPrior, GraspSettings
+    from factorgrasp.problems.human_dynamics import HumanDynamics
+    from factorgrasp.problems.human_dynamics_constraints import (
+        CentreOfPressure,
+        FrictionPyramid,
+        TorqueLimit,
+        UnilateralContact,
+    )
+    from factorgrasp.problems.human_dynamics_estimate import HumanDynamicsEstimate
+    from factorgrasp.problems.human_dynamics_sensors import (
+        Accelerometer,
+        ExternalWrench,
+        GyroscopeDerivative,
+        JointAcceleration,
+        JointTorque,
+    )
+    from factorgrasp.problems.human_dynamics_settings import HumanDynamicsNoise
+    from factorgrasp.problems.link_motion import LinkMotion
 
 _WHERE = {
+    "Accelerometer": "human_dynamics_sensors",
+    "CentreOfPressure": "human_dynamics_constraints",
+    "ExternalWrench": "human_dynamics_sensors",
+    "ExternalWrenches": "external_wrenches",
+    "ExternalWrenchesEstimate": "external_wrenches_estimate",
+    "FrictionPyramid": "human_dynamics_constraints",
     "GraspFromPosesEstimate": "grasp_from_poses_estimate",
     "GraspFromPosesNoise": "grasp_from_poses_settings",
     "GraspFromPosesSettings": "grasp_from_poses_settings",
@@ -26,9 +51,24 @@ _WHERE = {
     "GraspPoseFromPoses": "grasp_from_poses",
     "GraspPrior": "grasp_settings",
     "GraspSettings": "grasp_settings",
+    "GyroscopeDerivative": "human_dynamics_sensors",
+    "HumanDynamics": "human_dynamics",
+    "HumanDynamicsEstimate": "human_dynamics_estimate",
+    "HumanDynamicsNoise": "human_dynamics_settings",
+    "JointAcceleration": "human_dynamics_sensors",
+    "JointTorque": "human_dynamics_sensors",
+    "LinkMotion": "link_motion",
+    "TorqueLimit": "human_dynamics_constraints",
+    "UnilateralContact": "human_dynamics_constraints",
 }
 
 __all__ = [
+    "Accelerometer",
+    "CentreOfPressure",
+    "ExternalWrench",
+    "ExternalWrenches",
+    "ExternalWrenchesEstimate",
+    "FrictionPyramid",
     "GraspFromPosesEstimate",
     "GraspFromPosesNoise",
     "GraspFromPosesSettings",
@@ -38,6 +78,15 @@ __all__ = [
     "GraspPoseFromPoses",
     "GraspPrior",
     "GraspSettings",
+    "GyroscopeDerivative",
+    "HumanDynamics",
+    "HumanDynamicsEstimate",
+    "HumanDynamicsNoise",
+    "JointAcceleration",
+    "JointTorque",
+    "LinkMotion",
+    "TorqueLimit",
+    "UnilateralContact",
 ]
 
 

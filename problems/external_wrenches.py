@@ -1,11 +1,13 @@
-"""Wrenches that no sensor measures, from those that are measured and the rate of the whole body's momentum (mathematics 4.2, Tirupachuri 2021).
+"""Wrenches that no sensor measures, from those that are measured and the rate of the whole body's momentum.
 
-Unknowns of a frame: the net external wrench of every link in its frame. Rows: each against its measurement, against zero (tight on free links,
-loose on contacts without a sensor), and six that all share, about the body's centre of mass in world axes:
+Mathematics 4.2, Tirupachuri 2021. Unknowns of a frame: the net external wrench of every link in its frame. Rows: each against its
+measurement, against zero (tight on free links, loose on contacts without a sensor), and six that all share, about the body's centre of
+mass in world axes:
 
     ``sum_i X_G_i* f_i^x = hdot_G - w``,   w = [m g; 0],  hdot_G the full rate of the centroidal momentum.
 
-Everything but these six rows is block-diagonal, so that the estimate has a closed form of rank six (Woodbury), computed for all frames at once.
+Everything but these six rows is block-diagonal, so that the estimate has a closed form of rank six (Woodbury), computed for all frames
+at once.
 """
 
 from __future__ import annotations
@@ -42,7 +44,8 @@ class ExternalWrenches:
     noise : HumanDynamicsNoise
         Its `free_wrench` and `contact_wrench` are used.
     momentum_rate : PerName
-        Variances of ``hdot_G - w``: N^2 and (Nm)^2, six components in world axes. The paper has 1e-3; what accelerations from motion capture
+        Variances of ``hdot_G - w``: N^2 and (Nm)^2, six components in world axes. The paper has 1e-3; what accelerations from
+        motion capture
         leave is nearer to the default.
     """
 
@@ -69,7 +72,11 @@ class ExternalWrenches:
             if not isinstance(sensor, ExternalWrench):
                 raise InputError("sensors", "ExternalWrench", type(sensor).__name__)
             if sensor.values.shape[0] != len(motion):
-                raise InputError(sensor.name, f"values at the {len(motion)} frames of the motion", f"{sensor.values.shape[0]} rows")
+                raise InputError(
+                    sensor.name,
+                    f"values at the {len(motion)} frames of the motion",
+                    f"{sensor.values.shape[0]} rows",
+                )
             if sensor.link in self.contacts:
                 raise InputError("contacts", "links without a wrench sensor", repr(sensor.link))
             self._rows.append(sensor_rows(tree, sensor))
@@ -123,7 +130,9 @@ class ExternalWrenches:
         S = np.einsum("nlij,nlkj->nik", AC, A) + np.diag(self._momentum)
         innovation = self.motion.momentum_rate - np.einsum("nlij,nlj->ni", A, mean)
         gain = np.linalg.solve(S[:, None], AC)
-        posterior_mean = mean + (np.swapaxes(AC, -1, -2) @ np.linalg.solve(S, innovation[..., None])[:, None])[..., 0]
+        posterior_mean = (
+            mean + (np.swapaxes(AC, -1, -2) @ np.linalg.solve(S, innovation[..., None])[:, None])[..., 0]
+        )
         nis = np.einsum("ni,ni->n", innovation, np.linalg.solve(S, innovation[..., None])[..., 0])
         return ExternalWrenchesEstimate(
             t=self.motion.t,
@@ -150,11 +159,20 @@ class ExternalWrenches:
         )  # fmt: skip
         mean, C = part.prior()
         names = [wrench_on(link) for link in self.motion.links]
-        terms = [Term(f"prior of {name}", 6, (name,), Covariance.blocks(C[0, i]), unit="N, Nm") for i, name in enumerate(names)]
-        terms.append(Term("centroidal momentum rate", 6, tuple(names), Covariance.diagonal(self._momentum), unit="N, Nm"))
+        terms = [
+            Term(f"prior of {name}", 6, (name,), Covariance.blocks(C[0, i]), unit="N, Nm")
+            for i, name in enumerate(names)
+        ]
+        terms.append(
+            Term(
+                "centroidal momentum rate", 6, tuple(names), Covariance.diagonal(self._momentum), unit="N, Nm"
+            )
+        )
         problem = LeastSquares([Variable(name, 6, unit="N, Nm", components=WRENCH) for name in names], terms)
         for i, name in enumerate(names):
             problem.set_term(f"prior of {name}", {name: np.eye(6)}, mean[0, i])
         maps = part.centroidal_maps()[0]
-        problem.set_term("centroidal momentum rate", dict(zip(names, maps, strict=True)), part.motion.momentum_rate[0])
+        problem.set_term(
+            "centroidal momentum rate", dict(zip(names, maps, strict=True)), part.motion.momentum_rate[0]
+        )
         return problem

@@ -15,7 +15,14 @@ from factorgrasp.problems.link_motion_spatial import rotate
 from factorgrasp.typing import FloatArray
 from factorgrasp.uncertainty import nees_band
 
-AXES = ("force along x", "force along y", "force along z", "moment about x", "moment about y", "moment about z")
+AXES = (
+    "force along x",
+    "force along y",
+    "force along z",
+    "moment about x",
+    "moment about y",
+    "moment about z",
+)
 UNINFORMED = 0.5
 """Share of the prior variance that is left, from which a direction counts as not informed."""
 
@@ -101,7 +108,11 @@ class ExternalWrenchesEstimate:
         out = np.zeros((n, size, size))
         for a, i in enumerate(index):
             for b, j in enumerate(index):
-                block = -np.swapaxes(self.seen[:, i], 1, 2) @ self.gain[:, j] if not prior else np.zeros((n, 6, 6))
+                block = (
+                    -np.swapaxes(self.seen[:, i], 1, 2) @ self.gain[:, j]
+                    if not prior
+                    else np.zeros((n, 6, 6))
+                )
                 if i == j:
                     block = block + self.prior_covariance[:, i]
                 out[:, 6 * a : 6 * a + 6, 6 * b : 6 * b + 6] = block
@@ -118,7 +129,8 @@ class ExternalWrenchesEstimate:
         return WrenchSet(values, self.joint_covariance(chosen), "external wrenches by momentum", links=chosen)
 
     def payload(self, links: Sequence[str] | None = None) -> Payload:
-        """Mass that hangs on some links (all contacts): ``m = sum_h f_h' u_h / |u_h|^2`` with ``u_h = g - a_h``, the links' own motion included.
+        """Mass that hangs on some links (all contacts): ``m = sum_h f_h' u_h / |u_h|^2`` with ``u_h = g - a_h``, the links'
+        own motion included.
 
         Raises
         ------
@@ -128,7 +140,9 @@ class ExternalWrenchesEstimate:
         chosen = tuple(links) if links is not None else self.contacts
         for link in chosen:
             if link not in self.contacts:
-                raise InputError("payload", "links among the contacts " + ", ".join(self.contacts), repr(link))
+                raise InputError(
+                    "payload", "links among the contacts " + ", ".join(self.contacts), repr(link)
+                )
         reader = np.zeros((len(self), 6 * len(chosen)))
         values = np.concatenate([self.of(link) for link in chosen], axis=1)
         for a, link in enumerate(chosen):
@@ -140,10 +154,12 @@ class ExternalWrenchesEstimate:
         variance = np.einsum("ni,nij,nj->n", reader, self.joint_covariance(chosen), reader)
         weight = 1.0 / variance
         mean = float(np.sum(weight * mass) / np.sum(weight))
-        return Payload(chosen, mass, np.sqrt(variance), mean, float(np.sqrt(_inflation(mass - mean) / np.sum(weight))))
+        return Payload(
+            chosen, mass, np.sqrt(variance), mean, float(np.sqrt(_inflation(mass - mean) / np.sum(weight)))
+        )
 
     def observability(self) -> Observability:
-        """What the six momentum rows tell of the contacts, in world axes: totals, how they are shared by every two contacts, and squeezing.
+        """What the six momentum rows tell of the contacts: totals, how every two contacts share them, and squeezing, in world axes.
 
         Two contacts' forces may be told apart through the moments they make, as far as the prior keeps the contacts' own moments small.
         """
@@ -158,22 +174,48 @@ class ExternalWrenchesEstimate:
                 line /= np.maximum(np.linalg.norm(line, axis=1, keepdims=True), 1e-9)
                 squeeze = np.zeros((len(self), 6 * count))
                 squeeze[:, 6 * a : 6 * a + 3], squeeze[:, 6 * b : 6 * b + 3] = 0.5 * line, -0.5 * line
-                before, after = (float(np.mean(np.einsum("ni,nij,nj->n", squeeze, V, squeeze))) for V in (every_C, every_P))
-                found.append(_judged(squeeze.mean(axis=0), before, after, f"squeeze between {one} and {other} (force along the line through both)", "N"))
+                before, after = (
+                    float(np.mean(np.einsum("ni,nij,nj->n", squeeze, V, squeeze))) for V in (every_C, every_P)
+                )
+                found.append(
+                    _judged(
+                        squeeze.mean(axis=0),
+                        before,
+                        after,
+                        f"squeeze between {one} and {other} (force along the line through both)",
+                        "N",
+                    )
+                )
         for axis, words in enumerate(AXES):
             unit = "N" if axis < 3 else "Nm"
             total = np.zeros(6 * count)
             total[axis::6] = 1.0
-            what = f"{words} on {self.contacts[0]}" if count == 1 else f"total {words} on {', '.join(self.contacts)}"
+            what = (
+                f"{words} on {self.contacts[0]}"
+                if count == 1
+                else f"total {words} on {', '.join(self.contacts)}"
+            )
             found.append(_direction(total, C, P, what, unit))
             for a in range(count):
                 for b in range(a + 1, count):
                     share = np.zeros(6 * count)
                     share[6 * a + axis], share[6 * b + axis] = 0.5, -0.5
-                    found.append(_direction(share, C, P, f"how the {words} is shared between {self.contacts[a]} and {self.contacts[b]}", unit))
+                    found.append(
+                        _direction(
+                            share,
+                            C,
+                            P,
+                            f"how the {words} is shared between {self.contacts[a]} and {self.contacts[b]}",
+                            unit,
+                        )
+                    )
         found.sort(key=lambda d: d.sd / d.resolution, reverse=True)
         missing = any(not d.observable for d in found)
-        advice = "A wrench sensor on one of the contacts, or the knowledge that one of them is free, would tell their shares apart" if missing else ""
+        advice = (
+            "A wrench sensor on one of the contacts, or the knowledge that one of them is free, would tell their shares apart"
+            if missing
+            else ""
+        )
         return Observability(tuple(found), advice)
 
     def mass_words(self) -> str:
@@ -181,7 +223,10 @@ class ExternalWrenchesEstimate:
         g = self.motion.gravity
         # Vertical part of what motion demands beyond what is measured, as a mass: positive when the model is too heavy.
         extra = -self.momentum_innovation[:, :3] @ g / float(g @ g)
-        mean, sd = float(extra.mean()), float(np.sqrt(_inflation(extra - extra.mean()) * extra.var() / extra.size))
+        mean, sd = (
+            float(extra.mean()),
+            float(np.sqrt(_inflation(extra - extra.mean()) * extra.var() / extra.size)),
+        )
         side = "lighter" if mean > 0.0 else "heavier"
         return (
             f"the measured forces carry a body {abs(mean):.2f} kg {side} than the model's {self.motion.total_mass:.2f} kg "
@@ -193,13 +238,17 @@ class ExternalWrenchesEstimate:
         n = len(self)
         low, high = nees_band(6, n)
         ratio = float(self.nis.mean()) / 6.0
-        lines = [f"external wrenches: {n} frames; measured on {', '.join(self.measured) or 'nothing'}; unmeasured on {', '.join(self.contacts)}"]
+        lines = [
+            f"external wrenches: {n} frames; measured on {', '.join(self.measured) or 'nothing'}; unmeasured on {', '.join(self.contacts)}"
+        ]
         for link in self.contacts:
             force, sd = np.linalg.norm(self.of(link)[:, :3], axis=1), self.sd[:, self._index(link), :3]
             lines.append(f"  {link}: force {np.median(force):.1f} N (median), sd {np.median(sd):.2f} N")
         load = self.payload()
         lines.append(f"  payload {load.mean:.3f} kg, sd {load.mean_sd:.3f} kg")
-        lines.append(f"  momentum: NIS per degree of freedom {ratio:.3g} (95 % band {low:.2f} to {high:.2f} for independent frames)")
+        lines.append(
+            f"  momentum: NIS per degree of freedom {ratio:.3g} (95 % band {low:.2f} to {high:.2f} for independent frames)"
+        )
         lines += [f"  not informed: {d.words} (sd {d.sd:.3g} {d.unit})" for d in self.observability().missing]
         return "\n".join(lines)
 
@@ -225,7 +274,14 @@ def _direction(vector: FloatArray, C: FloatArray, P: FloatArray, words: str, uni
 
 def _judged(vector: FloatArray, before: float, after: float, words: str, unit: str) -> Direction:
     norm = float(np.linalg.norm(vector))
-    return Direction("contacts", vector / (norm or 1.0), float(np.sqrt(max(after, 0.0))), float(np.sqrt(UNINFORMED * before)), words, unit)
+    return Direction(
+        "contacts",
+        vector / (norm or 1.0),
+        float(np.sqrt(max(after, 0.0))),
+        float(np.sqrt(UNINFORMED * before)),
+        words,
+        unit,
+    )
 
 
 def _inflation(residual: FloatArray) -> float:

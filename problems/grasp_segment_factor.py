@@ -121,6 +121,7 @@ class SegmentFactor:
         read: Callable[[Any], State] = dict,
     ) -> None:
         self.model, self.moments, self.keys = model, moments, keys
+        self._gyro, self._accelerometer = _signed_root(moments.gyro), _signed_root(moments.accelerometer)
         self._slip_rate_variance = slip_rate_variance
         self._read = read
 
@@ -135,10 +136,9 @@ class SegmentFactor:
 
     def quadratic(self, state: State) -> Quadratic:
         """Second-order model of the cost at a state with the names of the grasp model."""
-        moments = self.moments
         L_g, L_a, J_g, J_a, slip = self._residuals(state)
-        c_g, g_g, H_g = quadratic_forms(L_g, J_g, moments.gyro)
-        c_a, g_a, H_a = quadratic_forms(L_a, J_a, moments.accelerometer)
+        c_g, g_g, H_g = _forms(L_g, J_g, *self._gyro)
+        c_a, g_a, H_a = _forms(L_a, J_a, *self._accelerometer)
         value, gradient, matrix = c_g + c_a, g_g + g_a, H_g + H_a
         if slip is not None:
             value += 0.5 * float(slip.rate @ slip.rate) / self._slip_rate_variance
@@ -235,6 +235,29 @@ class SegmentFactor:
             return -b
 
         return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(self.model.size + 1), list(self.keys), error)
+
+
+def _signed_root(Z: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """``S`` (m, m) and signs (m,) with ``Z = S diag(signs) S'``.
+
+    A residual ``L S`` loses its digits to gravity once; ``L Z L'`` would lose them squared.
+    """
+    diagonal = np.abs(np.diag(Z))
+    scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+    values, vectors = np.linalg.eigh(Z / np.outer(scale, scale))
+    return scale[:, None] * vectors * np.sqrt(np.abs(values)), np.sign(values)
+
+
+def _forms(
+    L: FloatArray, J: FloatArray, root: FloatArray, signs: FloatArray
+) -> tuple[float, FloatArray, FloatArray]:
+    """As :func:`quadratic_forms`, of ``root diag(signs) root'``."""
+    size, _, width = J.shape
+    residual = L @ root
+    signed = residual * signs
+    rows = (J.reshape(-1, width) @ root).reshape(size, -1)
+    matrix = (rows * np.tile(signs, 3)) @ rows.T
+    return 0.5 * float(np.sum(residual * signed)), rows @ signed.ravel(), matrix
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """Human dynamics: joint torques, wrenches and accelerations of an articulated body as one maximum a posteriori estimate a frame.
 
-Model and unknowns: mathematics 4.1 (Latella 2018, Tirupachuri 2021). Newton-Euler, sensors and a prior are rows with covariances; torques are
+Model and unknowns: mathematics 4.1 (Latella 2018, Tirupachuri 2021). Newton-Euler, sensors and a prior are rows with
+covariances; torques are
 linear read-outs with theirs.
 """
 
@@ -65,10 +66,20 @@ class HumanDynamics:
         count = len(motion)
         for sensor in self.sensors:
             if sensor.values.shape[0] != count:
-                raise InputError(sensor.name, f"values at the {count} frames of the motion", f"{sensor.values.shape[0]} rows")
+                raise InputError(
+                    sensor.name,
+                    f"values at the {count} frames of the motion",
+                    f"{sensor.values.shape[0]} rows",
+                )
         rows = [constraint.row_pattern(motion.tree) for constraint in self.constraints]
-        self.system = HumanDynamicsSystem(motion.tree, self.sensors, noise, contacts, use_motion, hard_dynamics, rows)
-        self._values = np.concatenate([sensor.values for sensor in self.sensors], axis=1) if self.sensors else np.zeros((count, 0))
+        self.system = HumanDynamicsSystem(
+            motion.tree, self.sensors, noise, contacts, use_motion, hard_dynamics, rows
+        )
+        self._values = (
+            np.concatenate([sensor.values for sensor in self.sensors], axis=1)
+            if self.sensors
+            else np.zeros((count, 0))
+        )
         self._whitening = Whitening(self.system, self.sensors)
         self._arguments = (noise, tuple(contacts), hard_dynamics, use_motion)
 
@@ -114,7 +125,9 @@ class HumanDynamics:
         entries, rhs = system.raw(k, values)
         problem.jacobian.matrix.data[:], problem.jacobian.rhs[:] = entries[0], rhs[0]
         for i, rows in enumerate(system.sensors):
-            problem.set_covariance(rows.name, self._whitening.covariance(i, index, values[0, system.value_slices[i]]))
+            problem.set_covariance(
+                rows.name, self._whitening.covariance(i, index, values[0, system.value_slices[i]])
+            )
         if system.hard_dynamics:
             hard, right = system.hard(k)
             problem.equalities.matrix.data[:], problem.equalities.rhs[:] = hard[0], right[0]
@@ -140,7 +153,12 @@ class HumanDynamics:
     def least_squares(self) -> LeastSquares:
         """The problem of a single frame, for :func:`factorgrasp.solve` with any solver."""
         if len(self) != 1:
-            raise InputError("human dynamics", "one frame here", f"{len(self)}", "Use solve_frames(problem), or solve(problem.at(k))")
+            raise InputError(
+                "human dynamics",
+                "one frame here",
+                f"{len(self)}",
+                "Use solve_frames(problem), or solve(problem.at(k))",
+            )
         return self.frame(0)
 
     def view(self, estimate: Estimate) -> HumanDynamicsEstimate:

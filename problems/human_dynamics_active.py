@@ -43,7 +43,9 @@ class ActiveConstraint:
         return f"{self.meaning}; giving way by 1 {self.unit} would lower half the chi-square by {self.multiplier:.3g}"
 
 
-def active_constraints(problem: HumanDynamics, k: LinkKinematics, result: Any) -> tuple[ActiveConstraint, ...]:
+def active_constraints(
+    problem: HumanDynamics, k: LinkKinematics, result: Any
+) -> tuple[ActiveConstraint, ...]:
     """All active rows, frame by frame; a row is active when its multiplier is larger than its slack (in N or Nm)."""
     out: list[ActiveConstraint] = []
     if not problem.constraints:
@@ -62,7 +64,9 @@ def active_constraints(problem: HumanDynamics, k: LinkKinematics, result: Any) -
             slack = limit - value
             for row in np.flatnonzero((z > slack) & (z > 1e-6)):
                 words = constraint.words(int(row))
-                out.append(ActiveConstraint(f, constraint.name, int(row), float(z[row]), constraint.unit, words))
+                out.append(
+                    ActiveConstraint(f, constraint.name, int(row), float(z[row]), constraint.unit, words)
+                )
     return tuple(out)
 
 

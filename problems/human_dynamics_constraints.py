@@ -17,7 +17,7 @@ from factorgrasp.least_squares import Constraint
 from factorgrasp.problems.human_dynamics_names import wrench_of, wrench_on
 from factorgrasp.problems.link_motion import BodyTree, LinkKinematics
 from factorgrasp.problems.link_motion_spatial import skew
-from factorgrasp.typing import FloatArray
+from factorgrasp.typing import FloatArray, IntArray
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class DynamicsConstraint(ABC):
     def words(self, row: int) -> str:
         """What it means that a row holds with equality."""
 
-    def frames(self, index: object) -> DynamicsConstraint:
+    def frames(self, index: IntArray) -> DynamicsConstraint:
         """The same constraint at some of the frames."""
         return self
 
@@ -76,7 +76,7 @@ class ContactConstraint(DynamicsConstraint):
         """``G_s`` (rows, 6): ``G_s w_s <= h`` for the wrench in the contact's frame."""
 
     def limit(self) -> FloatArray:
-        """h (rows,)."""
+        """H (rows,)."""
         return np.zeros(self.facets().shape[0])
 
     def row_pattern(self, tree: BodyTree) -> Constraint:
@@ -84,7 +84,14 @@ class ContactConstraint(DynamicsConstraint):
         if self.link not in tree.links:
             raise InputError(f"link of {self.name}", "one of " + ", ".join(tree.links), repr(self.link))
         G = self._in_link()
-        return Constraint(self.name, G.shape[0], (wrench_on(self.link),), "inequality", {wrench_on(self.link): G != 0.0}, self.unit)
+        return Constraint(
+            self.name,
+            G.shape[0],
+            (wrench_on(self.link),),
+            "inequality",
+            {wrench_on(self.link): G != 0.0},
+            self.unit,
+        )
 
     def rows(self, tree: BodyTree, k: LinkKinematics, frame: int) -> tuple[dict[str, FloatArray], FloatArray]:
         """Blocks and limits; the same in every frame, as the contact moves with the link."""
@@ -133,7 +140,11 @@ class FrictionPyramid(ContactConstraint):
 
     def __post_init__(self) -> None:
         if not self.friction > 0.0 or self.sides < 3:
-            raise InputError(f"friction of {self.link}", "a coefficient above zero and at least 3 sides", f"{self.friction}, {self.sides}")
+            raise InputError(
+                f"friction of {self.link}",
+                "a coefficient above zero and at least 3 sides",
+                f"{self.friction}, {self.sides}",
+            )
 
     @property
     def name(self) -> str:
@@ -144,13 +155,18 @@ class FrictionPyramid(ContactConstraint):
         """One row a side."""
         angle = 2.0 * np.pi * np.arange(self.sides) / self.sides
         out = np.zeros((self.sides, 6))
-        out[:, 0], out[:, 1], out[:, 2] = np.cos(angle), np.sin(angle), -self.friction * np.cos(np.pi / self.sides)
+        out[:, 0], out[:, 1], out[:, 2] = (
+            np.cos(angle),
+            np.sin(angle),
+            -self.friction * np.cos(np.pi / self.sides),
+        )
         return out
 
     def words(self, row: int) -> str:
         """What it means that a row holds with equality."""
         angle = 360.0 * row / self.sides
-        return f"{self.link} is at its friction limit (coefficient {self.friction:g}) towards {angle:.0f} deg from the x axis of the contact"
+        side = f"towards {angle:.0f} deg from the x axis of the contact"
+        return f"{self.link} is at its friction limit (coefficient {self.friction:g}) {side}"
 
 
 @dataclass(frozen=True)
@@ -163,7 +179,9 @@ class CentreOfPressure(ContactConstraint):
         (m, 2) in the x-y plane of the contact, counter-clockwise, m.
     """
 
-    corners: FloatArray = field(default_factory=lambda: np.array([[-0.06, -0.05], [0.18, -0.05], [0.18, 0.05], [-0.06, 0.05]]))
+    corners: FloatArray = field(
+        default_factory=lambda: np.array([[-0.06, -0.05], [0.18, -0.05], [0.18, 0.05], [-0.06, 0.05]])
+    )
 
     def __post_init__(self) -> None:
         corners = np.asarray(self.corners, dtype=float)
@@ -172,7 +190,9 @@ class CentreOfPressure(ContactConstraint):
         edges = np.roll(corners, -1, axis=0) - corners
         turn = edges[:, 0] * np.roll(edges[:, 1], -1) - edges[:, 1] * np.roll(edges[:, 0], -1)
         if np.any(turn <= 0.0):
-            raise InputError(f"corners of {self.link}", "a convex polygon, counter-clockwise", f"{corners.tolist()}")
+            raise InputError(
+                f"corners of {self.link}", "a convex polygon, counter-clockwise", f"{corners.tolist()}"
+            )
         object.__setattr__(self, "corners", corners)
 
     @property
@@ -197,7 +217,8 @@ class CentreOfPressure(ContactConstraint):
     def words(self, row: int) -> str:
         """What it means that a row holds with equality."""
         a, b = self.corners[row], self.corners[(row + 1) % len(self.corners)]
-        return f"the centre of pressure of {self.link} is on the edge from ({a[0]:.3f}, {a[1]:.3f}) to ({b[0]:.3f}, {b[1]:.3f}) m of its sole"
+        edge = f"from ({a[0]:.3f}, {a[1]:.3f}) to ({b[0]:.3f}, {b[1]:.3f}) m"
+        return f"the centre of pressure of {self.link} is on the edge {edge} of its sole"
 
 
 @dataclass(frozen=True)
@@ -242,7 +263,14 @@ class TorqueLimit(DynamicsConstraint):
         S = tree.subspaces[j]
         one = np.ones((len(tree.dofs[j]), 6), dtype=bool) if S is None else S.T != 0.0
         pattern = np.vstack([one, one])
-        return Constraint(self.name, pattern.shape[0], (wrench_of(self.joint),), "inequality", {wrench_of(self.joint): pattern}, "Nm")
+        return Constraint(
+            self.name,
+            pattern.shape[0],
+            (wrench_of(self.joint),),
+            "inequality",
+            {wrench_of(self.joint): pattern},
+            "Nm",
+        )
 
     def rows(self, tree: BodyTree, k: LinkKinematics, frame: int) -> tuple[dict[str, FloatArray], FloatArray]:
         """Blocks and limits of one frame."""
@@ -251,7 +279,9 @@ class TorqueLimit(DynamicsConstraint):
         back = S[0].T
         low, high = self._limits(back.shape[0])
         # A limit that is not there is one that no human joint reaches: an infinite one is no number for a solver.
-        return {wrench_of(self.joint): np.vstack([back, -back])}, np.minimum(np.concatenate([high, -low]), 1e6)
+        return {wrench_of(self.joint): np.vstack([back, -back])}, np.minimum(
+            np.concatenate([high, -low]), 1e6
+        )
 
     def words(self, row: int) -> str:
         """What it means that a row holds with equality."""
@@ -265,11 +295,17 @@ class TorqueLimit(DynamicsConstraint):
         try:
             return np.broadcast_to(low, (size,)), np.broadcast_to(high, (size,))
         except ValueError:
-            raise InputError(self.name, f"{size} limits or one for all, Nm", f"shapes {low.shape} and {high.shape}") from None
+            raise InputError(
+                self.name, f"{size} limits or one for all, Nm", f"shapes {low.shape} and {high.shape}"
+            ) from None
 
 
 def feet_on_the_floor(
-    links: Sequence[str], friction: float = 0.7, corners: FloatArray | None = None, R_l_s: FloatArray | None = None, p_l_s: ArrayLike = (0.0, 0.0, 0.0)
+    links: Sequence[str],
+    friction: float = 0.7,
+    corners: FloatArray | None = None,
+    R_l_s: FloatArray | None = None,
+    p_l_s: ArrayLike = (0.0, 0.0, 0.0),
 ) -> tuple[ContactConstraint, ...]:
     """Unilateral contact, friction and centre of pressure for every link, in the same frame of their soles."""
     R, p = np.eye(3) if R_l_s is None else np.asarray(R_l_s, dtype=float), np.asarray(p_l_s, dtype=float)

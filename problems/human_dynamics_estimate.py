@@ -94,7 +94,9 @@ class HumanDynamicsEstimate:
     @property
     def joint_moment_sd(self) -> FloatArray:
         """(n, J, 3) Nm."""
-        return np.asarray(np.sqrt(np.maximum(np.diagonal(self.joint_moment_covariance, axis1=2, axis2=3), 0.0)))
+        return np.asarray(
+            np.sqrt(np.maximum(np.diagonal(self.joint_moment_covariance, axis1=2, axis2=3), 0.0))
+        )
 
     def innovation(self, sensor: str) -> Innovation:
         """Innovation of a sensor by its name."""
@@ -122,8 +124,16 @@ def read_frames(problem: HumanDynamics, result: Any) -> HumanDynamicsEstimate:
     k = motion.kinematics()
     have = bool(result.marginals)
     nothing = np.full((count, 6, 6), np.nan)
-    P_joint = np.stack(result.marginals[:joints], axis=1) if have and joints else np.full((count, joints, 6, 6), np.nan)
-    P_link = np.stack(result.marginals[joints : joints + links], axis=1) if have else np.repeat(nothing[:, None], links, axis=1)
+    P_joint = (
+        np.stack(result.marginals[:joints], axis=1)
+        if have and joints
+        else np.full((count, joints, 6, 6), np.nan)
+    )
+    P_link = (
+        np.stack(result.marginals[joints : joints + links], axis=1)
+        if have
+        else np.repeat(nothing[:, None], links, axis=1)
+    )
     sd = np.sqrt(np.maximum(result.variances, 0.0)) if have else np.full(x.shape, np.nan)
     acceleration = x[:, columns.acceleration.ravel()].reshape(count, links, 6)
     acceleration_sd = sd[:, columns.acceleration.ravel()].reshape(count, links, 6)
@@ -149,7 +159,9 @@ def read_frames(problem: HumanDynamics, result: Any) -> HumanDynamicsEstimate:
         joint_names=tree.joints,
         dof_names=motion.dof_names,
         torque=np.concatenate(torque, axis=1) if torque else np.zeros((count, 0)),
-        torque_sd=np.sqrt(np.maximum(np.concatenate(torque_var, axis=1), 0.0)) if torque else np.zeros((count, 0)),
+        torque_sd=np.sqrt(np.maximum(np.concatenate(torque_var, axis=1), 0.0))
+        if torque
+        else np.zeros((count, 0)),
         torque_covariance=tuple(torque_cov),
         joint_moment=(T @ wrench[..., None])[..., 0],
         joint_force=(R @ wrench[..., :3, None])[..., 0],

@@ -1,6 +1,6 @@
 """Does a sensor agree with what all the others say of it? Innovations, their normalised squares (NIS), and covariances proposed from them.
 
-With the residual ``r = y - Y d`` of the estimate from all sensors and ``M = R - Y P Y'``, its covariance, the innovation of leaving the sensor
+With the residual ``r = y - Y d`` of the estimate from all sensors and its covariance ``M = R - Y P Y'``, the innovation of leaving the sensor
 out is ``R M^-1 r`` with covariance ``R M^-1 R``, so that ``NIS = r' M^-1 r``. Directions that nothing but the sensor itself informs (M near
 zero against R) cannot be judged; they are left out of the NIS and of its degrees of freedom.
 """
@@ -64,7 +64,10 @@ class Innovation:
 def innovations(problem: HumanDynamics, k: LinkKinematics, result: Any) -> tuple[Innovation, ...]:
     """One a sensor, from the estimate and its marginal covariances."""
     system = problem.system
-    known = {tuple(int(v) for v in group): block for group, block in zip(system.marginals, result.marginals, strict=True)}
+    known = {
+        tuple(int(v) for v in group): block
+        for group, block in zip(system.marginals, result.marginals, strict=True)
+    }
     out = []
     for i, (rows, sensor) in enumerate(zip(system.sensors, problem.sensors, strict=True)):
         group = system.touched(rows)
@@ -74,7 +77,13 @@ def innovations(problem: HumanDynamics, k: LinkKinematics, result: Any) -> tuple
 
 
 def _innovation(
-    rows: SensorRows, k: LinkKinematics, values: FloatArray, covariance: FloatArray, x: FloatArray, P: FloatArray, _: int
+    rows: SensorRows,
+    k: LinkKinematics,
+    values: FloatArray,
+    covariance: FloatArray,
+    x: FloatArray,
+    P: FloatArray,
+    _: int,
 ) -> Innovation:
     Y = rows.jacobian(k)
     measured = values if rows.offset is None else values - rows.offset(k)
@@ -97,7 +106,9 @@ def _innovation(
     nis = np.sum(np.where(judged, along**2 / np.where(judged, share, 1.0), 0.0), axis=1)
     diag = np.where(gaps | broken[:, None], np.nan, np.diagonal(M, axis1=1, axis2=2))
     counted = np.maximum(np.sum(np.isfinite(diag), axis=0), 1)
-    return Innovation(rows.name, rows.unit, residual, nis, judged.sum(axis=1), np.nansum(diag, axis=0) / counted)
+    return Innovation(
+        rows.name, rows.unit, residual, nis, judged.sum(axis=1), np.nansum(diag, axis=0) / counted
+    )
 
 
 @dataclass(frozen=True)
@@ -128,9 +139,11 @@ class CovarianceProposal:
 def propose_covariances(problem: HumanDynamics, estimate: Any) -> tuple[CovarianceProposal, ...]:
     """Variances of every sensor by the innovations of one solve: ``R_new = R * mean(r^2) / mean(M)``, component by component.
 
-    This is a step of variance-component estimation (Helmert, Foerstner). Limits: it takes the other covariances to be right, so that solving and
+    This is a step of variance-component estimation (Helmert, Foerstner). Limits: it takes the other covariances to be right,
+    so that solving and
     proposing again until it settles is needed when several are off, and then only their redundant parts can be told apart; model error
-    (masses, centres, soft tissue) goes into the sensor that notices it; bias counts as variance; a component that nobody else checks gets none.
+    (masses, centres, soft tissue) goes into the sensor that notices it; bias counts as variance; a component that nobody else
+    checks gets none.
 
     Parameters
     ----------
@@ -138,10 +151,14 @@ def propose_covariances(problem: HumanDynamics, estimate: Any) -> tuple[Covarian
     estimate : HumanDynamicsEstimate
         Of that problem, with covariance.
     """
-    out = []
+    out: list[CovarianceProposal] = []
     for sensor, found in zip(problem.sensors, estimate.innovations, strict=True):
         C = sensor.variances()
-        diagonal = C if C.ndim == 1 else (np.diagonal(C, axis1=-2, axis2=-1) if problem.system.sensors[len(out)].full else C)
+        diagonal = (
+            C
+            if C.ndim == 1
+            else (np.diagonal(C, axis1=-2, axis2=-1) if problem.system.sensors[len(out)].full else C)
+        )
         current = diagonal if diagonal.ndim == 1 else np.mean(diagonal, axis=0)
         share = found.redundancy
         square = np.nanmean(np.where(np.isnan(found.residual), np.nan, found.residual**2), axis=0)
@@ -155,7 +172,9 @@ def propose_covariances(problem: HumanDynamics, estimate: Any) -> tuple[Covarian
             words += ("; " if words else "") + f"only about {samples:.0f} independent samples"
         bias = np.nanmean(found.residual, axis=0) ** 2 / np.where(square > 0.0, square, 1.0)
         if np.any(bias[checked] > 0.5):
-            words += ("; " if words else "") + "most of it is a constant error, which a variance does not describe"
+            words += (
+                "; " if words else ""
+            ) + "most of it is a constant error, which a variance does not describe"
         out.append(CovarianceProposal(found.name, current, proposed, samples, sd, words))
     return tuple(out)
 
@@ -167,5 +186,11 @@ def _independent(residual: FloatArray) -> float:
         return float(good.shape[0])
     centred = good - good.mean(axis=0)
     power = np.sum(centred**2, axis=0)
-    rho = float(np.clip(np.mean(np.sum(centred[1:] * centred[:-1], axis=0) / np.where(power > 0.0, power, 1.0)), 0.0, 0.9999))
-    return good.shape[0] * (1.0 - rho) / (1.0 + rho)
+    rho = float(
+        np.clip(
+            np.mean(np.sum(centred[1:] * centred[:-1], axis=0) / np.where(power > 0.0, power, 1.0)),
+            0.0,
+            0.9999,
+        )
+    )
+    return float(good.shape[0] * (1.0 - rho) / (1.0 + rho))

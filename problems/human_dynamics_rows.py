@@ -9,7 +9,12 @@ import numpy as np
 
 from factorgrasp.errors import InputError
 from factorgrasp.problems import human_dynamics_sensors as kinds
-from factorgrasp.problems.human_dynamics_names import acceleration_of, joint_acceleration_of, wrench_of, wrench_on
+from factorgrasp.problems.human_dynamics_names import (
+    acceleration_of,
+    joint_acceleration_of,
+    wrench_of,
+    wrench_on,
+)
 from factorgrasp.problems.human_dynamics_sensors import Sensor
 from factorgrasp.problems.link_motion import BodyTree, LinkKinematics
 from factorgrasp.problems.link_motion_spatial import cross, rotate, skew
@@ -72,7 +77,9 @@ def sensor_rows(tree: BodyTree, sensor: Sensor) -> SensorRows:
         if link not in tree.links:
             raise InputError(f"link of {sensor.name}", "one of " + ", ".join(tree.links), repr(link))
         on_base = tree.fixed_base and link == tree.links[tree.root]
-        if on_base and isinstance(sensor, kinds.Accelerometer | kinds.GyroscopeDerivative | kinds.LinkAcceleration):
+        if on_base and isinstance(
+            sensor, kinds.Accelerometer | kinds.GyroscopeDerivative | kinds.LinkAcceleration
+        ):
             raise InputError(f"link of {sensor.name}", "a link that moves", f"{link!r}, the fixed base")
     make = _MAKERS.get(type(sensor))
     if make is None:
@@ -82,8 +89,14 @@ def sensor_rows(tree: BodyTree, sensor: Sensor) -> SensorRows:
     constant = {name: block for name, block in blocks.items() if name not in varying}
     placement = None
     if isinstance(sensor, kinds.Accelerometer):
-        placement = (tree.links.index(sensor.link), np.asarray(sensor.R_l_s, dtype=float).T, np.asarray(sensor.p_l_s, dtype=float))
-    return SensorRows(sensor.name, sensor.size, sensor.unit, full, patterns, constant, varying, offset, placement)
+        placement = (
+            tree.links.index(sensor.link),
+            np.asarray(sensor.R_l_s, dtype=float).T,
+            np.asarray(sensor.p_l_s, dtype=float),
+        )
+    return SensorRows(
+        sensor.name, sensor.size, sensor.unit, full, patterns, constant, varying, offset, placement
+    )
 
 
 Made = tuple[dict[str, FloatArray], dict[str, Make], Make | None]
@@ -92,7 +105,11 @@ Made = tuple[dict[str, FloatArray], dict[str, Make], Make | None]
 
 def _accelerometer(tree: BodyTree, sensor: Sensor) -> Made:
     assert isinstance(sensor, kinds.Accelerometer)
-    at, back, r = tree.links.index(sensor.link), np.asarray(sensor.R_l_s, dtype=float).T, np.asarray(sensor.p_l_s, dtype=float)
+    at, back, r = (
+        tree.links.index(sensor.link),
+        np.asarray(sensor.R_l_s, dtype=float).T,
+        np.asarray(sensor.p_l_s, dtype=float),
+    )
     _check_placement(sensor, back, r)
     block = np.concatenate([back, -back @ skew(r)], axis=1)
 
@@ -119,7 +136,7 @@ def _external_wrench(tree: BodyTree, sensor: Sensor) -> Made:
     assert isinstance(sensor, kinds.ExternalWrench)
     name, at = wrench_on(sensor.link), tree.links.index(sensor.link)
     if sensor.frame == "world":
-        pattern = np.kron(np.eye(2), np.ones((3, 3)))
+        pattern: FloatArray = np.kron(np.eye(2), np.ones((3, 3)))
 
         def make(k: LinkKinematics) -> FloatArray:
             out = np.zeros((k.count, 6, 6))
@@ -163,7 +180,9 @@ def _joint_acceleration(tree: BodyTree, sensor: Sensor) -> Made:
 def _wrench_set(tree: BodyTree, sensor: Sensor) -> Made:
     assert isinstance(sensor, kinds.WrenchSet)
     if sensor.size != 6 * len(sensor.links) or not sensor.links:
-        raise InputError(sensor.name, f"six columns for each of {len(sensor.links)} links", str(sensor.values.shape))
+        raise InputError(
+            sensor.name, f"six columns for each of {len(sensor.links)} links", str(sensor.values.shape)
+        )
     blocks = {}
     for i, link in enumerate(sensor.links):
         block = np.zeros((sensor.size, 6))
@@ -219,14 +238,20 @@ def _joint(tree: BodyTree, sensor: Sensor) -> int:
 def _joint_with_axes(tree: BodyTree, sensor: Sensor) -> int:
     j = _joint(tree, sensor)
     if not tree.dofs[j]:
-        raise InputError(f"joint of {sensor.name}", "a joint with known axes", f"{sensor.where!r}, whose axes are unknown")
+        raise InputError(
+            f"joint of {sensor.name}", "a joint with known axes", f"{sensor.where!r}, whose axes are unknown"
+        )
     if sensor.size != len(tree.dofs[j]):
-        raise InputError(sensor.name, f"{len(tree.dofs[j])} columns ({', '.join(tree.dofs[j])})", f"{sensor.size}")
+        raise InputError(
+            sensor.name, f"{len(tree.dofs[j])} columns ({', '.join(tree.dofs[j])})", f"{sensor.size}"
+        )
     return j
 
 
 def _check_placement(sensor: Sensor, R: FloatArray, p: FloatArray) -> None:
     if R.shape != (3, 3) or p.shape != (3,):
-        raise InputError(f"placement of {sensor.name}", "R_l_s (3, 3) and p_l_s (3,) m", f"{R.shape} and {p.shape}")
+        raise InputError(
+            f"placement of {sensor.name}", "R_l_s (3, 3) and p_l_s (3,) m", f"{R.shape} and {p.shape}"
+        )
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0.0:
         raise InputError(f"R_l_s of {sensor.name}", "a rotation matrix", f"{R.T.tolist()}")

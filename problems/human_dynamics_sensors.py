@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from factorgrasp.errors import InputError
-from factorgrasp.typing import FloatArray
+from factorgrasp.typing import BoolArray, FloatArray, IntArray
 
 CovarianceLike = float | Sequence[float] | FloatArray
 """Variances: one for all components, one a component, or a full covariance; a leading axis of frames makes it vary over time."""
@@ -28,7 +28,8 @@ class Sensor:
     values : ndarray
         (n, k) measurements; NaN where there is none.
     covariance : float or array_like
-        Variances in squared units of the values: scalar, (k,), (k, k), (n, k) or (n, k, k). An array (k, k) with n == k frames is a full covariance.
+        Variances in squared units of the values: scalar, (k,), (k, k), (n, k) or (n, k, k). An array (k, k) with n == k frames
+        is a full covariance.
     name : str
         For reports; made from the kind and the link when empty.
     """
@@ -48,7 +49,9 @@ class Sensor:
         if not self.name:
             object.__setattr__(self, "name", f"{self.kind} of {self.where}")
         if values.ndim != 2 or (self.width and values.shape[1] != self.width):
-            raise InputError(f"{self.name}", f"values of shape (n, {self.width or 'k'}) in {self.unit}", str(values.shape))
+            raise InputError(
+                f"{self.name}", f"values of shape (n, {self.width or 'k'}) in {self.unit}", str(values.shape)
+            )
         if np.any(np.isinf(values)):
             raise InputError(f"{self.name}", f"finite numbers in {self.unit}, NaN for gaps", "infinity")
         self.variances()
@@ -77,25 +80,39 @@ class Sensor:
             C = np.full(k, float(C))
         shapes = ((k,), (k, k), (n, k), (n, k, k))
         if C.shape not in shapes:
-            raise InputError(f"covariance of {self.name}", f"a scalar or one of the shapes {shapes}", str(C.shape))
-        full = C.ndim == 3 or C.shape == (k, k) and not (k == 1)
+            raise InputError(
+                f"covariance of {self.name}", f"a scalar or one of the shapes {shapes}", str(C.shape)
+            )
+        full = C.ndim == 3 or (C.shape == (k, k) and k != 1)
         if not np.all(np.isfinite(C)):
-            raise InputError(f"covariance of {self.name}", "finite variances", "NaN or infinity", "A gap is a NaN among the values")
+            raise InputError(
+                f"covariance of {self.name}",
+                "finite variances",
+                "NaN or infinity",
+                "A gap is a NaN among the values",
+            )
         if full:
             if np.linalg.eigvalsh(C).min() <= 0.0:
-                raise InputError(f"covariance of {self.name}", "a positive definite matrix", "a singular or indefinite one")
+                raise InputError(
+                    f"covariance of {self.name}", "a positive definite matrix", "a singular or indefinite one"
+                )
         elif np.any(C <= 0.0):
-            raise InputError(f"covariance of {self.name}", f"variances above zero in ({self.unit})^2", f"{C.min():.6g}")
+            raise InputError(
+                f"covariance of {self.name}", f"variances above zero in ({self.unit})^2", f"{C.min():.6g}"
+            )
         return C
 
-    def frames(self, index: object) -> Sensor:
+    def frames(self, index: slice | IntArray | BoolArray) -> Sensor:
         """The same sensor at some of the frames."""
         from dataclasses import replace
 
-        n, k = self.values.shape
+        k = self.size
         C = np.asarray(self.covariance, dtype=float)
         varies = C.ndim == 3 or (C.ndim == 2 and C.shape != (k, k))
-        changed: dict[str, object] = {"values": self.values[index], "covariance": C[index] if varies else self.covariance}  # type: ignore[index]
+        changed: dict[str, object] = {
+            "values": self.values[index],
+            "covariance": C[index] if varies else self.covariance,
+        }
         return replace(self, **changed)  # type: ignore[arg-type]
 
 
@@ -233,9 +250,7 @@ class MomentumRate(Sensor):
         return "the body"
 
 
-def plate_wrench(
-    force: ArrayLike, point: ArrayLike, free_moment: ArrayLike, origin: ArrayLike
-) -> FloatArray:
+def plate_wrench(force: ArrayLike, point: ArrayLike, free_moment: ArrayLike, origin: ArrayLike) -> FloatArray:
     """Wrench (n, 6) in world axes about `origin` from a force plate's force, centre of pressure and free moment.
 
     Parameters

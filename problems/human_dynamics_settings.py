@@ -58,7 +58,9 @@ class HumanDynamicsNoise:
     @classmethod
     def tirupachuri2021(cls) -> HumanDynamicsNoise:
         """Tirupachuri 2021, table 1: model 1e-6, feet and free links 1e-6, hand force 1 and moment 1e-4, prior 1e6."""
-        return cls(propagation=1e-6, balance=1e-6, free_wrench=1e-6, contact_wrench=(1.0, 1.0, 1.0, 1e-4, 1e-4, 1e-4))
+        return cls(
+            propagation=1e-6, balance=1e-6, free_wrench=1e-6, contact_wrench=(1.0, 1.0, 1.0, 1e-4, 1e-4, 1e-4)
+        )
 
 
 def resolve(value: PerName, names: Sequence[str], sizes: Sequence[int], field: str) -> list[FloatArray]:
@@ -74,7 +76,11 @@ def resolve(value: PerName, names: Sequence[str], sizes: Sequence[int], field: s
         if unknown:
             raise InputError(field, "names among " + ", ".join(names) + " or 'default'", ", ".join(unknown))
         if "default" not in value and set(value) != set(names):
-            raise InputError(field, "all names or a 'default'", "nothing for " + ", ".join(n for n in names if n not in value))
+            raise InputError(
+                field,
+                "all names or a 'default'",
+                "nothing for " + ", ".join(n for n in names if n not in value),
+            )
         chosen = [value[name] if name in value else value["default"] for name in names]
     else:
         chosen = [value] * len(names)

@@ -1,6 +1,7 @@
 """The rows of the human-dynamics problem: one fixed sparse pattern, filled for all frames at once (mathematics 4.1).
 
-Unknowns of a frame, all in link frames: per link the proper acceleration ``alpha_i`` and the net external wrench ``f_i^x``; per joint the wrench
+Unknowns of a frame, all in link frames: per link the proper acceleration ``alpha_i`` and the net external wrench ``f_i^x``;
+per joint the wrench
 ``f_j`` of the parent on the child and, where its axes are known, ``qdd_j``. Of the entries only joint transforms and moving axes change.
 """
 
@@ -13,12 +14,17 @@ import numpy as np
 
 from factorgrasp.errors import InputError
 from factorgrasp.least_squares import Constraint, LeastSquares, Term
-from factorgrasp.problems.human_dynamics_names import acceleration_of, joint_acceleration_of, wrench_of, wrench_on
+from factorgrasp.problems.human_dynamics_names import (
+    acceleration_of,
+    joint_acceleration_of,
+    wrench_of,
+    wrench_on,
+)
 from factorgrasp.problems.human_dynamics_rows import SensorRows, sensor_rows
 from factorgrasp.problems.human_dynamics_sensors import Sensor
 from factorgrasp.problems.human_dynamics_settings import HumanDynamicsNoise, resolve
 from factorgrasp.problems.link_motion import BodyTree, LinkKinematics
-from factorgrasp.problems.link_motion_spatial import cross, cross_force
+from factorgrasp.problems.link_motion_spatial import centripetal, velocity_wrench
 from factorgrasp.typing import BoolArray, FloatArray, IntArray
 from factorgrasp.uncertainty import Covariance
 from factorgrasp.variables import Variable
@@ -66,7 +72,8 @@ class HumanDynamicsSystem:
     contacts : sequence of str
         Links that may carry an unmeasured wrench.
     use_motion : bool
-        Take the motion's own accelerations (of joints with axes, of a floating root, of links behind joints without axes) as measurements where
+        Take the motion's own accelerations (of joints with axes, of a floating root, of links behind joints without axes) as
+        measurements where
         no sensor gives them.
     hard_dynamics : bool
         Propagation and balance as equality constraints.
@@ -95,12 +102,29 @@ class HumanDynamicsSystem:
         names = [rows.name for rows in self._sensor_rows]
         if len(set(names)) != len(names):
             twice = sorted({name for name in names if names.count(name) > 1})
-            raise InputError("sensors", "unique names", ", ".join(twice) + " more than once", "Give each its own name=")
+            raise InputError(
+                "sensors", "unique names", ", ".join(twice) + " more than once", "Give each its own name="
+            )
         dynamics = self._dynamics_terms()
         kinematic = self._kinematic_terms(sensors) if use_motion else []
-        measured = [Term(r.name, r.size, tuple(r.patterns), self._first_covariance(r), pattern=r.patterns, unit=r.unit) for r in self._sensor_rows]
-        terms = [*([] if hard_dynamics else dynamics), *kinematic, *measured, *self._zero_terms(sensors), *self._prior_terms(variables)]
-        hard = [Constraint(t.name, t.rows, t.variables, "equality", t.pattern, t.unit) for t in dynamics] if hard_dynamics else []
+        measured = [
+            Term(
+                r.name, r.size, tuple(r.patterns), self._first_covariance(r), pattern=r.patterns, unit=r.unit
+            )
+            for r in self._sensor_rows
+        ]
+        terms = [
+            *([] if hard_dynamics else dynamics),
+            *kinematic,
+            *measured,
+            *self._zero_terms(sensors),
+            *self._prior_terms(variables),
+        ]
+        hard = (
+            [Constraint(t.name, t.rows, t.variables, "equality", t.pattern, t.unit) for t in dynamics]
+            if hard_dynamics
+            else []
+        )
         self.pattern = LeastSquares(variables, terms, [*hard, *inequalities])
         self.columns = self._columns()
         self._prepare()
@@ -115,7 +139,11 @@ class HumanDynamicsSystem:
     @property
     def marginals(self) -> tuple[IntArray, ...]:
         """Joint wrenches (J), external wrenches (L), joint accelerations, then whatever else a sensor touches."""
-        out = [*self.columns.joint_wrench, *self.columns.external_wrench, *(self.columns.joint_acceleration[j] for j in self.axes)]
+        out = [
+            *self.columns.joint_wrench,
+            *self.columns.external_wrench,
+            *(self.columns.joint_acceleration[j] for j in self.axes),
+        ]
         known = {tuple(group) for group in out}
         for rows in self._sensor_rows:
             group = self.touched(rows)
@@ -141,7 +169,12 @@ class HumanDynamicsSystem:
         out += [Variable(wrench_on(link), 6, unit="N, Nm", components=WRENCH) for link in tree.links]
         out += [Variable(wrench_of(joint), 6, unit="N, Nm", components=WRENCH) for joint in tree.joints]
         out += [
-            Variable(joint_acceleration_of(tree.joints[j]), len(tree.dofs[j]), unit="rad/s^2", components=tree.dofs[j])
+            Variable(
+                joint_acceleration_of(tree.joints[j]),
+                len(tree.dofs[j]),
+                unit="rad/s^2",
+                components=tree.dofs[j],
+            )
             for j in self.axes
         ]
         return out
@@ -175,7 +208,16 @@ class HumanDynamicsSystem:
                 np.ones((6, len(tree.dofs[j])), dtype=bool) if S is None else S != 0.0
             )
             name = f"propagation through {tree.joints[j]}"
-            terms.append(Term(name, 6, tuple(pattern), Covariance.diagonal(variance), pattern=pattern, unit="m/s^2, rad/s^2"))
+            terms.append(
+                Term(
+                    name,
+                    6,
+                    tuple(pattern),
+                    Covariance.diagonal(variance),
+                    pattern=pattern,
+                    unit="m/s^2, rad/s^2",
+                )
+            )
         for i, link in enumerate(tree.links):
             pattern = {wrench_on(link): eye}
             if not self._given(i) and np.any(tree.spatial_inertia[i]):
@@ -185,7 +227,16 @@ class HumanDynamicsSystem:
                     pattern[wrench_of(joint)] = eye
                 elif tree.parents[j] == i:
                     pattern[wrench_of(joint)] = _MOTION.T
-            terms.append(Term(f"balance of {link}", 6, tuple(pattern), Covariance.diagonal(balance[i]), pattern=pattern, unit="N, Nm"))
+            terms.append(
+                Term(
+                    f"balance of {link}",
+                    6,
+                    tuple(pattern),
+                    Covariance.diagonal(balance[i]),
+                    pattern=pattern,
+                    unit="N, Nm",
+                )
+            )
         return terms
 
     def _given(self, link: int) -> bool:
@@ -200,28 +251,64 @@ class HumanDynamicsSystem:
             behind.add(tree.root)
         self._motion_links = [i for i in sorted(behind) if ("link acceleration", tree.links[i]) not in have]
         names = [tree.joints[j] for j in self.axes]
-        spread = resolve(noise.joint_acceleration, names, [len(tree.dofs[j]) for j in self.axes], "joint acceleration variance")
+        spread = resolve(
+            noise.joint_acceleration,
+            names,
+            [len(tree.dofs[j]) for j in self.axes],
+            "joint acceleration variance",
+        )
         by_joint = dict(zip(self.axes, spread, strict=True))
-        by_link = resolve(noise.link_acceleration, tree.links, [6] * len(tree.links), "link acceleration variance")
+        by_link = resolve(
+            noise.link_acceleration, tree.links, [6] * len(tree.links), "link acceleration variance"
+        )
         terms = []
         for j in self._motion_joints:
             name = joint_acceleration_of(tree.joints[j])
             size = len(tree.dofs[j])
             pattern = {name: np.eye(size, dtype=bool)}
-            terms.append(Term(f"motion: {name}", size, (name,), Covariance.diagonal(by_joint[j]), pattern=pattern, unit="rad/s^2"))
+            terms.append(
+                Term(
+                    f"motion: {name}",
+                    size,
+                    (name,),
+                    Covariance.diagonal(by_joint[j]),
+                    pattern=pattern,
+                    unit="rad/s^2",
+                )
+            )
         for i in self._motion_links:
             name = acceleration_of(tree.links[i])
-            terms.append(Term(f"motion: {name}", 6, (name,), Covariance.diagonal(by_link[i]), pattern={name: np.eye(6, dtype=bool)}))
+            terms.append(
+                Term(
+                    f"motion: {name}",
+                    6,
+                    (name,),
+                    Covariance.diagonal(by_link[i]),
+                    pattern={name: np.eye(6, dtype=bool)},
+                )
+            )
         return terms
 
     def _zero_terms(self, sensors: Sequence[Sensor]) -> list[Term]:
         tree = self.tree
-        measured = {link for s in sensors if s.kind.startswith("external wrench") for link in getattr(s, "links", (s.where,))}
+        measured = {
+            link
+            for s in sensors
+            if s.kind.startswith("external wrench")
+            for link in getattr(s, "links", (s.where,))
+        }
         twice = measured & set(self.contacts)
         if twice:
-            raise InputError("contacts", "links without a wrench sensor", ", ".join(sorted(twice)), "A measured wrench needs no entry here")
+            raise InputError(
+                "contacts",
+                "links without a wrench sensor",
+                ", ".join(sorted(twice)),
+                "A measured wrench needs no entry here",
+            )
         free = resolve(self.noise.free_wrench, tree.links, [6] * len(tree.links), "free wrench variance")
-        loose = resolve(self.noise.contact_wrench, tree.links, [6] * len(tree.links), "contact wrench variance")
+        loose = resolve(
+            self.noise.contact_wrench, tree.links, [6] * len(tree.links), "contact wrench variance"
+        )
         terms = []
         for i, link in enumerate(tree.links):
             if link in measured:
@@ -230,23 +317,35 @@ class HumanDynamicsSystem:
             name = f"unmeasured wrench on {link}" if touched else f"no wrench on {link}"
             pattern = {wrench_on(link): np.eye(6, dtype=bool)}
             variance = loose[i] if touched else free[i]
-            terms.append(Term(name, 6, (wrench_on(link),), Covariance.diagonal(variance), pattern=pattern, unit="N, Nm"))
+            terms.append(
+                Term(
+                    name, 6, (wrench_on(link),), Covariance.diagonal(variance), pattern=pattern, unit="N, Nm"
+                )
+            )
         return terms
 
     def _prior_terms(self, variables: Sequence[Variable]) -> list[Term]:
         tree, noise = self.tree, self.noise
         links = [6] * len(tree.links)
         by_name: dict[str, FloatArray] = {}
-        for name, variance in zip(tree.links, resolve(noise.prior_link_acceleration, tree.links, links, "prior variance"), strict=True):
+        for name, variance in zip(
+            tree.links,
+            resolve(noise.prior_link_acceleration, tree.links, links, "prior variance"),
+            strict=True,
+        ):
             by_name[acceleration_of(name)] = variance
-        for name, variance in zip(tree.links, resolve(noise.prior_external_wrench, tree.links, links, "prior variance"), strict=True):
+        for name, variance in zip(
+            tree.links, resolve(noise.prior_external_wrench, tree.links, links, "prior variance"), strict=True
+        ):
             by_name[wrench_on(name)] = variance
         joints = resolve(noise.prior_joint_wrench, tree.joints, [6] * len(tree.joints), "prior variance")
         for name, variance in zip(tree.joints, joints, strict=True):
             by_name[wrench_of(name)] = variance
         names = [tree.joints[j] for j in self.axes]
         sizes = [len(tree.dofs[j]) for j in self.axes]
-        for name, variance in zip(names, resolve(noise.prior_joint_acceleration, names, sizes, "prior variance"), strict=True):
+        for name, variance in zip(
+            names, resolve(noise.prior_joint_acceleration, names, sizes, "prior variance"), strict=True
+        ):
             by_name[joint_acceleration_of(name)] = variance
         return [
             Term(f"prior of {v.name}", v.size, (v.name,), Covariance.diagonal(by_name[v.name]), pattern={v.name: np.eye(v.size, dtype=bool)}, unit=v.unit)
@@ -256,7 +355,11 @@ class HumanDynamicsSystem:
     @staticmethod
     def _first_covariance(rows: SensorRows) -> Covariance:
         """Any covariance of the right kind: a full one couples the pattern of its rows."""
-        return Covariance.blocks(np.eye(rows.size)) if rows.full and rows.size > 1 else Covariance.diagonal(np.ones(rows.size))
+        return (
+            Covariance.blocks(np.eye(rows.size))
+            if rows.full and rows.size > 1
+            else Covariance.diagonal(np.ones(rows.size))
+        )
 
     # ---- places and constants ---------------------------------------------------------------------------------
 
@@ -270,7 +373,9 @@ class HumanDynamicsSystem:
         pattern = self.pattern
 
         def put(rows: str, variable: str, value: FloatArray, block: BoolArray | None = None) -> None:
-            (dynamics if rows in dynamics.slices else soft).set_block(rows, variable, value if block is None else value[block])
+            (dynamics if rows in dynamics.slices else soft).set_block(
+                rows, variable, value if block is None else value[block]
+            )
 
         through, up, moving = [], [], []
         for j in self.axes:
@@ -293,10 +398,14 @@ class HumanDynamicsSystem:
             put(f"balance of {tree.links[tree.children[j]]}", wrench_of(joint), -np.eye(6))
             up.append((j, dynamics.places(f"balance of {tree.links[tree.parents[j]]}", wrench_of(joint))))
         if moving:
-            writers.append((np.concatenate([at for _, at in moving]), _minus_axes(tree, [j for j, _ in moving])))
+            writers.append(
+                (np.concatenate([at for _, at in moving]), _minus_axes(tree, [j for j, _ in moving]))
+            )
         for pairs, kind in ((through, _minus_transform), (up, _transposed_transform)):
             if pairs:
-                writers.append((np.concatenate([at for _, at in pairs]), kind(np.array([j for j, _ in pairs]))))
+                writers.append(
+                    (np.concatenate([at for _, at in pairs]), kind(np.array([j for j, _ in pairs])))
+                )
         for name, term in pattern.terms.items():
             if name.startswith(("motion: ", "no wrench on ", "unmeasured wrench on ", "prior of ")):
                 soft.set_block(name, term.variables[0], np.eye(term.rows))
@@ -320,23 +429,37 @@ class HumanDynamicsSystem:
         self._balance = _rows(where, [f"balance of {link}" for link in tree.links])
         slices = pattern.jacobian.slices
         have = hasattr(self, "_motion_joints")
-        self._motion_rows = _rows(slices, [f"motion: {joint_acceleration_of(tree.joints[j])}" for j in self._motion_joints] if have else [])
-        self._motion_link_rows = _rows(slices, [f"motion: {acceleration_of(tree.links[i])}" for i in self._motion_links] if have else [])
+        self._motion_rows = _rows(
+            slices,
+            [f"motion: {joint_acceleration_of(tree.joints[j])}" for j in self._motion_joints] if have else [],
+        )
+        self._motion_link_rows = _rows(
+            slices, [f"motion: {acceleration_of(tree.links[i])}" for i in self._motion_links] if have else []
+        )
         if have:
             ends = np.cumsum([0, *(len(tree.dofs[j]) for j in self.axes)])
             at = {j: np.arange(ends[k], ends[k + 1]) for k, j in enumerate(self.axes)}
-            self._motion_dofs = np.concatenate([at[j] for j in self._motion_joints] or [np.empty(0, dtype=np.intp)]).astype(np.intp)
+            self._motion_dofs = np.concatenate(
+                [at[j] for j in self._motion_joints] or [np.empty(0, dtype=np.intp)]
+            ).astype(np.intp)
         self._sensor_range = _rows(slices, [rows.name for rows in self._sensor_rows])
         indptr = pattern.jacobian.matrix.indptr
         first = self._sensor_range.start
         self._sensor_entries = slice(int(indptr[first]), int(indptr[self._sensor_range.stop]))
         self._sensor_of_entry = pattern.jacobian.row_of_entry[self._sensor_entries] - first
-        self.value_slices = tuple(slice(slices[r.name].start - first, slices[r.name].stop - first) for r in self._sensor_rows)
-        placed = [(r.placement, where) for r, where in zip(self._sensor_rows, self.value_slices, strict=True) if r.placement]
+        self.value_slices = tuple(
+            slice(slices[r.name].start - first, slices[r.name].stop - first) for r in self._sensor_rows
+        )
+        placed = [
+            (r.placement, where)
+            for r, where in zip(self._sensor_rows, self.value_slices, strict=True)
+            if r.placement
+        ]
         self._imus = None
         if placed:
             self._imus = (
-                np.array([p[0] for p, _ in placed]), np.array([p[1] for p, _ in placed]), np.array([p[2] for p, _ in placed]),
+                np.array([p[0] for p, _ in placed], dtype=np.int64), np.array([p[1] for p, _ in placed]), np.array([p[2] for p,
+                _ in placed]),
                 np.concatenate([np.arange(where.start, where.stop) for _, where in placed]),
             )  # fmt: skip
 
@@ -368,8 +491,7 @@ class HumanDynamicsSystem:
         right = values.copy()
         if self._imus is not None:
             links, back, arm, at = self._imus
-            v, w = k.velocity[:, links, :3], k.velocity[:, links, 3:]
-            known = (back @ cross(w, v + cross(w, arm))[..., None])[..., 0]
+            known = centripetal(k.velocity, links, back, arm)
             right[:, at] -= known.reshape(count, -1)
         # One sum finds a NaN several times faster than isnan.
         if np.isnan(values.sum()):
@@ -392,8 +514,7 @@ class HumanDynamicsSystem:
 
     def _dynamics_rhs(self, k: LinkKinematics) -> tuple[FloatArray, FloatArray]:
         tree, count = self.tree, k.count
-        momentum = (tree.spatial_inertia @ k.velocity[..., None])[..., 0]
-        balance = -cross_force(k.velocity, momentum)
+        balance = velocity_wrench(tree.spatial_inertia, k.velocity)
         bias = k.bias
         if tree.fixed_base:
             given = k.acceleration[:, tree.root]

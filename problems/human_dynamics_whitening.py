@@ -8,7 +8,7 @@ import numpy as np
 
 from factorgrasp.problems.human_dynamics_sensors import Sensor
 from factorgrasp.problems.human_dynamics_system import HumanDynamicsSystem
-from factorgrasp.typing import FloatArray
+from factorgrasp.typing import BoolArray, FloatArray
 from factorgrasp.uncertainty import Covariance
 
 
@@ -73,7 +73,7 @@ class Whitening:
             rhs[:, where] = (W @ rhs[:, where, None])[..., 0]
 
 
-def _without(C: FloatArray, gaps: FloatArray) -> FloatArray:
+def _without(C: FloatArray, gaps: BoolArray) -> FloatArray:
     """Covariances (..., k, k) of what is there, with ones where a row is missing."""
     missing = gaps[..., :, None] | gaps[..., None, :]
     return np.where(missing, np.eye(C.shape[-1]), C)

@@ -53,13 +53,19 @@ class LinkJoint:
     def __post_init__(self) -> None:
         if self.subspace is None:
             if self.dofs:
-                raise InputError(f"subspace of joint {self.name}", f"(6, {len(self.dofs)}) for its degrees of freedom", "none")
+                raise InputError(
+                    f"subspace of joint {self.name}",
+                    f"(6, {len(self.dofs)}) for its degrees of freedom",
+                    "none",
+                )
             return
         S = np.asarray(self.subspace, dtype=float)
         object.__setattr__(self, "subspace", S)
         if S.ndim not in (2, 3) or S.shape[-2:] != (6, len(self.dofs)) or not 1 <= len(self.dofs) <= 6:
             raise InputError(
-                f"subspace of joint {self.name}", f"shape (6, n) or (frames, 6, n) with n = {len(self.dofs)} from 1 to 6", str(S.shape)
+                f"subspace of joint {self.name}",
+                f"shape (6, n) or (frames, 6, n) with n = {len(self.dofs)} from 1 to 6",
+                str(S.shape),
             )
 
     @property
@@ -115,7 +121,8 @@ class LinkKinematics:
         """``S_j``, (n, 6, n_j) by joint; None where the axes are unknown."""
         ends = np.cumsum(self.sizes)
         return tuple(
-            np.swapaxes(self.axes[:, end - size : end], 1, 2) if size else None for end, size in zip(ends, self.sizes, strict=True)
+            np.swapaxes(self.axes[:, end - size : end], 1, 2) if size else None
+            for end, size in zip(ends, self.sizes, strict=True)
         )
 
     def select(self, frames: slice) -> LinkKinematics:
@@ -235,10 +242,14 @@ class LinkMotion:
         check_names([dof for joint in self.joints for dof in joint.dofs], "degrees of freedom")
         check_masses(self.links, self.mass, self.com, self.inertia)
         check_rotations(self.R, self.links)
-        object.__setattr__(self, "_root", check_tree(self.links, [j.name for j in self.joints], self.parents, self.children))
+        object.__setattr__(
+            self, "_root", check_tree(self.links, [j.name for j in self.joints], self.parents, self.children)
+        )
         for joint in self.joints:
             if joint.subspace is not None and joint.subspace.ndim == 3 and joint.subspace.shape[0] != count:
-                raise InputError(f"subspace of joint {joint.name}", f"{count} frames", str(joint.subspace.shape[0]))
+                raise InputError(
+                    f"subspace of joint {joint.name}", f"{count} frames", str(joint.subspace.shape[0])
+                )
 
     # ---- structure --------------------------------------------------------------------------------------------
 
@@ -248,7 +259,7 @@ class LinkMotion:
     @property
     def root(self) -> int:
         """Index of the root link."""
-        return int(getattr(self, "_root"))  # noqa: B009
+        return int(getattr(self, "_root"))
 
     @property
     def parents(self) -> IntArray:
@@ -267,7 +278,7 @@ class LinkMotion:
 
     @property
     def total_mass(self) -> float:
-        """kg."""
+        """Kg."""
         return float(self.mass.sum())
 
     def link(self, name: str) -> int:
@@ -287,10 +298,21 @@ class LinkMotion:
         """The same body at some of the frames."""
         index = np.arange(len(self))[frames]
         joints = tuple(
-            joint if joint.subspace is None or joint.subspace.ndim == 2 else replace(joint, subspace=joint.subspace[index])
+            joint
+            if joint.subspace is None or joint.subspace.ndim == 2
+            else replace(joint, subspace=joint.subspace[index])
             for joint in self.joints
         )
-        names = ("t", "R", "p", "velocity", "angular_velocity", "acceleration", "angular_acceleration", "joint_centre")
+        names = (
+            "t",
+            "R",
+            "p",
+            "velocity",
+            "angular_velocity",
+            "acceleration",
+            "angular_acceleration",
+            "joint_centre",
+        )
         parts = {name: getattr(self, name)[index] for name in names}
         qdd = None if self.joint_acceleration is None else self.joint_acceleration[index]
         return replace(self, joints=joints, joint_acceleration=qdd, **parts)
@@ -315,13 +337,17 @@ class LinkMotion:
     @cached_property
     def spatial_velocity(self) -> FloatArray:
         """(n, L, 6) ``v_i``, in the link's frame."""
-        return np.concatenate([rotate_back(self.R, self.velocity), rotate_back(self.R, self.angular_velocity)], axis=-1)
+        return np.concatenate(
+            [rotate_back(self.R, self.velocity), rotate_back(self.R, self.angular_velocity)], axis=-1
+        )
 
     @cached_property
     def proper_acceleration(self) -> FloatArray:
         """(n, L, 6) ``alpha_i = R' [a - w x v - g; dw/dt]``: spatial acceleration minus gravity, in the link's frame."""
         linear = self.acceleration - np.cross(self.angular_velocity, self.velocity) - self.gravity
-        return np.concatenate([rotate_back(self.R, linear), rotate_back(self.R, self.angular_acceleration)], axis=-1)
+        return np.concatenate(
+            [rotate_back(self.R, linear), rotate_back(self.R, self.angular_acceleration)], axis=-1
+        )
 
     @cached_property
     def joint_transform(self) -> FloatArray:
@@ -334,21 +360,25 @@ class LinkMotion:
     def subspaces(self) -> tuple[FloatArray | None, ...]:
         """``S_j`` of every joint, (1 or n, 6, n_j)."""
         return tuple(
-            None if joint.subspace is None else joint.subspace.reshape(-1, 6, joint.size) for joint in self.joints
+            None if joint.subspace is None else joint.subspace.reshape(-1, 6, joint.size)
+            for joint in self.joints
         )
 
     @cached_property
     def qdd(self) -> FloatArray:
         """(n, dofs) joint accelerations: those given, else the ones that fit the accelerations of the links best.
 
-        The fit takes the bias to be ``v x S qd``: exact for axes that are fixed in the child. Whatever it is, :attr:`joint_bias` belongs to it,
+        The fit takes the bias to be ``v x S qd``: exact for axes that are fixed in the child. Whatever it is,
+        :attr:`joint_bias` belongs to it,
         so that the links' accelerations are met all the same.
         """
         if self.joint_acceleration is not None:
             return self.joint_acceleration
         relative = self._relative_acceleration - self._constant_axes_bias
         parts = [
-            (np.linalg.pinv(S) @ relative[:, j, :, None])[..., 0] for j, S in enumerate(self.subspaces) if S is not None
+            (np.linalg.pinv(S) @ relative[:, j, :, None])[..., 0]
+            for j, S in enumerate(self.subspaces)
+            if S is not None
         ]
         return np.concatenate(parts, axis=1) if parts else np.zeros((len(self), 0))
 
@@ -368,7 +398,9 @@ class LinkMotion:
     @cached_property
     def _relative_acceleration(self) -> FloatArray:
         alpha = self.proper_acceleration
-        return np.asarray(alpha[:, self.children] - (self.joint_transform @ alpha[:, self.parents, :, None])[..., 0])
+        return np.asarray(
+            alpha[:, self.children] - (self.joint_transform @ alpha[:, self.parents, :, None])[..., 0]
+        )
 
     @cached_property
     def _constant_axes_bias(self) -> FloatArray:
@@ -384,7 +416,11 @@ class LinkMotion:
     @cached_property
     def _kinematics(self) -> LinkKinematics:
         count = len(self)
-        columns = [np.broadcast_to(np.swapaxes(S, 1, 2), (count, S.shape[2], 6)) for S in self.subspaces if S is not None]
+        columns = [
+            np.broadcast_to(np.swapaxes(S, 1, 2), (count, S.shape[2], 6))
+            for S in self.subspaces
+            if S is not None
+        ]
         axes = np.concatenate(columns, axis=1) if columns else np.zeros((count, 0, 6))
         return LinkKinematics(
             self.R, self.p, self.spatial_velocity, self.proper_acceleration, self.joint_transform, self.joint_bias,
@@ -407,7 +443,8 @@ class LinkMotion:
     def momentum_rate(self) -> FloatArray:
         """(n, 6) ``hdot_G - w``: full rate of the centroidal momentum minus weight, about the body's centre of mass, world axes.
 
-        ``sum_i [m a_ci - m g; (c_i - c_G) x m (a_ci - g) + I_i dw_i + w_i x I_i w_i]`` (mathematics 4.2); it equals the sum of the external wrenches.
+        ``sum_i [m a_ci - m g; (c_i - c_G) x m (a_ci - g) + I_i dw_i + w_i x I_i w_i]`` (mathematics 4.2); it equals the sum of
+        the external wrenches.
         """
         arm = rotate(self.R, self.com)
         w, dw = self.angular_velocity, self.angular_acceleration

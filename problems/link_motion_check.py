@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from factorgrasp.errors import InputError
-from factorgrasp.typing import FloatArray
+from factorgrasp.typing import FloatArray, IntArray
 
 # An inertia from rounded tables may miss the triangle inequality by this share of its largest moment.
 TRIANGLE_SLACK = 1e-3
@@ -20,7 +20,9 @@ def check_names(names: Sequence[str], what: str) -> None:
             raise InputError(f"{what}[{place}]", "a name", repr(name))
     repeated = sorted({name for name in names if list(names).count(name) > 1})
     if repeated:
-        raise InputError(f"{what}", "unique names", ", ".join(repr(name) for name in repeated) + " more than once")
+        raise InputError(
+            f"{what}", "unique names", ", ".join(repr(name) for name in repeated) + " more than once"
+        )
 
 
 def check_masses(links: Sequence[str], mass: FloatArray, com: FloatArray, inertia: FloatArray) -> None:
@@ -30,7 +32,7 @@ def check_masses(links: Sequence[str], mass: FloatArray, com: FloatArray, inerti
             raise InputError(f"mass of {link}", "a finite mass of at least 0 kg", f"{mass[i]:.6g} kg")
         if not np.all(np.isfinite(com[i])):
             raise InputError(f"centre of mass of {link}", "finite coordinates in m", f"{com[i]}")
-        I = inertia[i]  # noqa: E741
+        I = inertia[i]
         if not np.all(np.isfinite(I)):
             raise InputError(f"inertia of {link}", "finite numbers in kg m^2", "NaN or infinity")
         scale = float(np.abs(I).max())
@@ -39,7 +41,9 @@ def check_masses(links: Sequence[str], mass: FloatArray, com: FloatArray, inerti
         moments = np.linalg.eigvalsh(I)
         if moments[0] < -1e-9 * scale:
             raise InputError(
-                f"inertia of {link}", "a positive semidefinite matrix in kg m^2", f"principal moments {moments}"
+                f"inertia of {link}",
+                "a positive semidefinite matrix in kg m^2",
+                f"principal moments {moments}",
             )
         if moments[0] + moments[1] < (1.0 - TRIANGLE_SLACK) * moments[2]:
             raise InputError(
@@ -65,15 +69,21 @@ def check_rotations(R: FloatArray, links: Sequence[str]) -> None:
         )
 
 
-def check_tree(links: Sequence[str], joints: Sequence[str], parents: FloatArray, children: FloatArray) -> int:
+def check_tree(links: Sequence[str], joints: Sequence[str], parents: IntArray, children: IntArray) -> int:
     """Index of the one root of the tree; InputError when the joints do not make a tree over the links."""
     seen: dict[int, str] = {}
     for name, parent, child in zip(joints, parents, children, strict=True):
         for end, index in (("parent", int(parent)), ("child", int(child))):
             if not 0 <= index < len(links):
-                raise InputError(f"{end} of joint {name}", f"the index of one of {len(links)} links", str(index))
+                raise InputError(
+                    f"{end} of joint {name}", f"the index of one of {len(links)} links", str(index)
+                )
         if int(child) in seen:
-            raise InputError(f"joint {name}", "one joint to a parent for every link", f"{links[int(child)]} is also the child of {seen[int(child)]}")
+            raise InputError(
+                f"joint {name}",
+                "one joint to a parent for every link",
+                f"{links[int(child)]} is also the child of {seen[int(child)]}",
+            )
         seen[int(child)] = name
     roots = [i for i in range(len(links)) if i not in seen]
     if len(roots) != 1:

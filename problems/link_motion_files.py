@@ -26,8 +26,10 @@ def load_links(
     Parameters
     ----------
     path : path
-        Archive with ``t`` (n,), ``bodies``, ``mass`` kg, ``com`` m and ``inertia`` kg m^2 (body axes, about the centre of mass), ``R`` (n, L, 3, 3)
-        body to ground, ``p`` body origin, ``w``, ``al`` angular velocity and acceleration, ``vcom``, ``acom`` of the centres of mass (all in ground axes),
+        Archive with ``t`` (n,), ``bodies``, ``mass`` kg, ``com`` m and ``inertia`` kg m^2 (body axes, about the centre of
+        mass), ``R`` (n, L, 3, 3)
+        body to ground, ``p`` body origin, ``w``, ``al`` angular velocity and acceleration, ``vcom``, ``acom`` of the centres
+        of mass (all in ground axes),
         ``joints``, ``jparent``, ``jchild`` and ``jpos`` (n, J, 3), the joint centres in ground axes.
     gravity : tuple
         In ground axes, m/s^2; the default is that of a ground with y up.
@@ -42,7 +44,9 @@ def load_links(
     with np.load(path, allow_pickle=False) as archive:
         missing = [name for name in NEEDED if name not in archive]
         if missing:
-            raise InputError(str(Path(path).name), "the fields " + ", ".join(NEEDED), "no " + ", ".join(missing))
+            raise InputError(
+                str(Path(path).name), "the fields " + ", ".join(NEEDED), "no " + ", ".join(missing)
+            )
         data = {name: archive[name] for name in NEEDED}
     links = [str(name) for name in data["bodies"]]
     real: dict[str, FloatArray] = {
@@ -65,11 +69,11 @@ def load_links(
             joints.append(LinkJoint(name, parent_at, child_at))
     unknown = sorted(set(ball_joints) - {joint.name for joint in joints})
     if unknown:
-        raise InputError("ball_joints", "among " + ", ".join(joint.name for joint in joints), ", ".join(unknown))
+        raise InputError(
+            "ball_joints", "among " + ", ".join(joint.name for joint in joints), ", ".join(unknown)
+        )
     return LinkMotion.from_com_motion(
         t=real["t"], links=tuple(links), mass=real["mass"], com=real["com"], inertia=real["inertia"], R=real["R"], p=real["p"],
         angular_velocity=real["w"], angular_acceleration=real["al"], com_velocity=real["vcom"], com_acceleration=real["acom"],
         joints=tuple(joints), joint_centre=real["jpos"][:, kept], gravity=np.asarray(gravity, dtype=float),
     )  # fmt: skip
-
-

@@ -58,7 +58,11 @@ class PinocchioTree:
     """
 
     def __init__(
-        self, model: Any, merge_massless: bool = True, gravity: ArrayLike = GRAVITY, compiled: bool | None = None
+        self,
+        model: Any,
+        merge_massless: bool = True,
+        gravity: ArrayLike = GRAVITY,
+        compiled: bool | None = None,
     ) -> None:
         self.model, self.gravity = model, np.asarray(gravity, dtype=float)
         self._data = model.createData()
@@ -66,13 +70,20 @@ class PinocchioTree:
             raise InputError("model", "at least one joint", "none")
         self.floating = "FreeFlyer" in model.joints[1].shortname() and int(model.parents[1]) == 0
         massless = [
-            merge_massless and i > int(self.floating) and model.inertias[i].mass == 0.0 and not np.any(model.inertias[i].inertia)
+            merge_massless
+            and i > int(self.floating)
+            and model.inertias[i].mass == 0.0
+            and not np.any(model.inertias[i].inertia)
             for i in range(model.njoints)
         ]
         below: list[list[int]] = [[] for _ in range(model.njoints)]
         for i in range(1, model.njoints):
             below[int(model.parents[i])].append(i)
-        self._kept = [i for i in range(model.njoints) if not (massless[i] and len(below[i]) == 1) and (i or not self.floating)]
+        self._kept = [
+            i
+            for i in range(model.njoints)
+            if not (massless[i] and len(below[i]) == 1) and (i or not self.floating)
+        ]
         place = {i: k for k, i in enumerate(self._kept)}
         self._chains: list[_Chain] = []
         for i in self._kept:
@@ -84,16 +95,22 @@ class PinocchioTree:
                 parent = int(model.parents[parent])
             self._chains.append(_Chain(tuple(reversed(members)), place[parent], place[i]))
         self.links = tuple(_link_name(model, i) for i in self._kept)
-        self.joint_names = tuple(str(model.names[c.members[-1]]) if len(c.members) == 1 else _chain_name(model, c) for c in self._chains)
+        self.joint_names = tuple(
+            str(model.names[c.members[-1]]) if len(c.members) == 1 else _chain_name(model, c)
+            for c in self._chains
+        )
         self.mass = np.array([model.inertias[i].mass for i in self._kept])
         self.com = np.array([model.inertias[i].lever for i in self._kept])
         self.inertia = np.array([model.inertias[i].inertia for i in self._kept])
         for i, link in zip(self._kept, self.links, strict=True):
             if not np.isfinite(model.inertias[i].mass) or model.inertias[i].mass < 0.0:
-                raise InputError(f"mass of {link}", "a finite mass of at least 0 kg", f"{model.inertias[i].mass:.6g} kg")
+                raise InputError(
+                    f"mass of {link}", "a finite mass of at least 0 kg", f"{model.inertias[i].mass:.6g} kg"
+                )
         self._joint_kinds = [None, *(_JointKind(model, i) for i in range(1, model.njoints))]
         self._columns = [
-            np.concatenate([np.arange(model.idx_vs[m], model.idx_vs[m] + model.nvs[m]) for m in c.members]) for c in self._chains
+            np.concatenate([np.arange(model.idx_vs[m], model.idx_vs[m] + model.nvs[m]) for m in c.members])
+            for c in self._chains
         ]
         self._fixed_subspaces = [
             self._kind(c.members[0]).subspace if len(c.members) == 1 else None for c in self._chains
@@ -101,13 +118,17 @@ class PinocchioTree:
         self._dofs = tuple(
             tuple(name for m in c.members for name in _dof_names(model, m)) for c in self._chains
         )
-        self._child_of_column = np.concatenate([np.full(c.size, chain.child) for c, chain in zip(self._columns, self._chains, strict=True)])
+        self._child_of_column = np.concatenate(
+            [np.full(c.size, chain.child) for c, chain in zip(self._columns, self._chains, strict=True)]
+        )
         self._all_columns: IntArray = np.concatenate(self._columns)
         self._sizes = tuple(int(c.size) for c in self._columns)
         self._starts = np.cumsum([0, *self._sizes[:-1]])
         self.parents: IntArray = np.array([c.parent for c in self._chains], dtype=np.int64)
         self.children: IntArray = np.array([c.child for c in self._chains], dtype=np.int64)
-        self._compiled = compiled is not False and all(kind.kind in link_motion_kernels.KINDS for kind in self._joint_kinds[1:] if kind)
+        self._compiled = compiled is not False and all(
+            kind.kind in link_motion_kernels.KINDS for kind in self._joint_kinds[1:] if kind
+        )
         self._constants = self._kernel_constants()
         self._quaternions = [
             int(model.idx_qs[i]) + (3 if self._kind(i).kind == "freeflyer" else 0)
@@ -157,12 +178,16 @@ class PinocchioTree:
     def kinematics(self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike) -> LinkKinematics:
         """The same as body-frame quantities, which is all that the equations of motion need."""
         positions, v, a = (np.atleast_2d(np.asarray(x, dtype=float)) for x in (q, qd, qdd))
-        for name, value, width in (("q", positions, self.model.nq), ("qd", v, self.model.nv), ("qdd", a, self.model.nv)):
+        for name, value, width in (
+            ("q", positions, self.model.nq),
+            ("qd", v, self.model.nv),
+            ("qdd", a, self.model.nv),
+        ):
             if value.ndim != 2 or value.shape[1] != width or value.shape[0] != positions.shape[0]:
                 raise InputError(name, f"shape ({positions.shape[0]}, {width})", str(value.shape))
         kernel = link_motion_kernels.load() if self._compiled else None
         if kernel is not None:
-            return self._by_kernel(kernel, positions, v, a)
+            return self._by_kernel(kernel.kinematics, positions, v, a)
         by_frame = positions.shape[0] <= FEW_FRAMES and np.all(np.isfinite(positions))
         R, p, vel, acc, axes = (self._by_frame if by_frame else self._vectorised)(positions, v, a)
         acc[..., :3] -= rotate_back(R, np.broadcast_to(self.gravity, p.shape))
@@ -178,10 +203,21 @@ class PinocchioTree:
         count, links, joints, dofs = q.shape[0], len(self._kept), len(self._chains), self._all_columns.size
         for at in self._quaternions:
             _check_quaternions(q[:, at : at + 4])
-        R, p, vel, acc = np.empty((count, links, 3, 3)), np.empty((count, links, 3)), np.empty((count, links, 6)), np.empty((count, links, 6))
-        X, bias, axes = np.empty((count, joints, 6, 6)), np.empty((count, joints, 6)), np.empty((count, dofs, 6))
+        R, p, vel, acc = (
+            np.empty((count, links, 3, 3)),
+            np.empty((count, links, 3)),
+            np.empty((count, links, 6)),
+            np.empty((count, links, 6)),
+        )
+        X, bias, axes = (
+            np.empty((count, joints, 6, 6)),
+            np.empty((count, joints, 6)),
+            np.empty((count, dofs, 6)),
+        )
         kernel(*self._constants[:7], q, v, a, *self._constants[7:], R, p, vel, acc, X, bias, axes)
-        return LinkKinematics(R, p, vel, acc, X, bias, axes, self._sizes, a[:, self._all_columns], p[:, self._constants[10]])
+        return LinkKinematics(
+            R, p, vel, acc, X, bias, axes, self._sizes, a[:, self._all_columns], p[:, self._constants[10]]
+        )
 
     # ---- internals --------------------------------------------------------------------------------------------
 
@@ -195,7 +231,12 @@ class PinocchioTree:
             axes[i] = 0.0 if one.axis is None else one.axis
         R = np.array([np.asarray(model.jointPlacements[i].rotation) for i in range(number)])
         p = np.array([np.asarray(model.jointPlacements[i].translation) for i in range(number)])
-        columns = [(m, part, c) for c, chain in enumerate(self._chains) for m in chain.members for part in range(int(model.nvs[m]))]
+        columns = [
+            (m, part, c)
+            for c, chain in enumerate(self._chains)
+            for m in chain.members
+            for part in range(int(model.nvs[m]))
+        ]
         joint, part, owner = (np.array(column, dtype=np.int64) for column in zip(*columns, strict=True))
 
         def whole(values: Any) -> IntArray:
@@ -235,7 +276,9 @@ class PinocchioTree:
         R_c, p_c = R[:, self._child_of_column], p[:, self._child_of_column]
         columns = np.swapaxes(J[:, :, self._all_columns], 1, 2)
         w = columns[..., 3:]
-        S = np.concatenate([rotate_back(R_c, columns[..., :3] + np.cross(w, p_c)), rotate_back(R_c, w)], axis=-1)
+        S = np.concatenate(
+            [rotate_back(R_c, columns[..., :3] + np.cross(w, p_c)), rotate_back(R_c, w)], axis=-1
+        )
         return R, p, vel, acc, S
 
     def _vectorised(self, q: FloatArray, v: FloatArray, a: FloatArray) -> tuple[FloatArray, ...]:
@@ -257,7 +300,12 @@ class PinocchioTree:
             p.append(p[up] + rotate(R[up], p_up))
             v_joint = (S @ rate[:, :, None])[..., 0]
             vel.append(_into(R_up, p_up, vel[up]) + v_joint)
-            acc.append(_into(R_up, p_up, acc[up]) + (S @ second[:, :, None])[..., 0] + c + cross_motion(vel[i], v_joint))
+            acc.append(
+                _into(R_up, p_up, acc[up])
+                + (S @ second[:, :, None])[..., 0]
+                + c
+                + cross_motion(vel[i], v_joint)
+            )
             own.append(S)
         S_all: list[FloatArray] = []
         for chain in self._chains:
@@ -296,7 +344,9 @@ class _JointKind:
         name = self._name.removeprefix("JointModel")
         if name in ("RX", "RY", "RZ", "PX", "PY", "PZ", "RUBX", "RUBY", "RUBZ"):
             self.axis = np.eye(3)["XYZ".index(name[-1])]
-            self.kind = {"RU": "unbounded", "PX": "prismatic", "PY": "prismatic", "PZ": "prismatic"}.get(name[:2], "revolute")
+            self.kind = {"RU": "unbounded", "PX": "prismatic", "PY": "prismatic", "PZ": "prismatic"}.get(
+                name[:2], "revolute"
+            )
         elif name in ("RevoluteUnaligned", "RevoluteUnboundedUnaligned", "PrismaticUnaligned"):
             # Through the data: the bindings offer the axis of the generic joint under no name.
             data = joint.createData()
@@ -342,7 +392,9 @@ class _JointKind:
             p = q
         return R, p, S, np.zeros((count, 6))
 
-    def _frame_by_frame(self, q: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    def _frame_by_frame(
+        self, q: FloatArray, v: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         data = self._joint.createData()
         count = q.shape[0]
         R, p = np.empty((count, 3, 3)), np.empty((count, 3))
@@ -374,7 +426,9 @@ def _check_quaternions(q: FloatArray) -> FloatArray:
     bad = np.isfinite(norm) & (np.abs(norm - 1.0) > 1e-3)
     if bad.any():
         frame = int(np.flatnonzero(bad)[0])
-        raise InputError("quaternion in q", "unit length, [x, y, z, w]", f"length {norm[frame]:.4g} in frame {frame}")
+        raise InputError(
+            "quaternion in q", "unit length, [x, y, z, w]", f"length {norm[frame]:.4g} in frame {frame}"
+        )
     return np.asarray(norm)
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from factorgrasp.typing import FloatArray
+from factorgrasp.problems import link_motion_kernels
+from factorgrasp.typing import FloatArray, IntArray
 
 
 def skew(v: FloatArray) -> FloatArray:
@@ -88,3 +89,24 @@ def cross_motion(v: FloatArray, m: FloatArray) -> FloatArray:
     linear, angular = v[..., :3], v[..., 3:]
     first, second = m[..., :3], m[..., 3:]
     return np.concatenate([cross(angular, first) + cross(linear, second), cross(angular, second)], axis=-1)
+
+
+def velocity_wrench(inertia: FloatArray, velocity: FloatArray) -> FloatArray:
+    """``-v x* I v`` of every link: spatial inertias (L, 6, 6), velocities (n, L, 6)."""
+    kernels = link_motion_kernels.load()
+    if kernels is None:
+        return -cross_force(velocity, (inertia @ velocity[..., None])[..., 0])
+    out = np.empty(velocity.shape)
+    kernels.velocity_wrench(inertia, velocity, out)
+    return out
+
+
+def centripetal(velocity: FloatArray, links: IntArray, R_s_l: FloatArray, p_l_s: FloatArray) -> FloatArray:
+    """Known part (n, S, 3) of what accelerometers on `links` (S,) read: ``R_s_l [w x (v + w x p)]``."""
+    kernels = link_motion_kernels.load()
+    if kernels is None:
+        v, w = velocity[:, links, :3], velocity[:, links, 3:]
+        return np.asarray((R_s_l @ cross(w, v + cross(w, p_l_s))[..., None])[..., 0])
+    out = np.empty((velocity.shape[0], links.size, 3))
+    kernels.centripetal(velocity, links, R_s_l, p_l_s, out)
+    return out

@@ -25,9 +25,9 @@ def load(lanes: int) -> Callable[..., None] | None:
 
     source = _solver(lanes)
     try:
-        return numba.njit(cache=True, error_model="numpy", fastmath={"contract"})(source)  # type: ignore[no-any-return]
+        return numba.njit(cache=True, error_model="numpy", fastmath={"contract"})(source)
     except RuntimeError:  # no writable place for the cache
-        return numba.njit(error_model="numpy", fastmath={"contract"})(source)  # type: ignore[no-any-return]
+        return numba.njit(error_model="numpy", fastmath={"contract"})(source)
 
 
 def _solver(lanes: int) -> Any:
@@ -99,6 +99,18 @@ def _solver(lanes: int) -> Any:
                         L[(below + j) * lanes + w] = pivot
                     inverse[w] = 1.0 / pivot
                 pair = update_start[j]
+                if lanes == 1:
+                    scale = inverse[0]
+                    for p in range(factor_indptr[j], factor_indptr[j + 1]):
+                        mine = L[p]
+                        for q in range(factor_indptr[j], p):
+                            # Entries before p are scaled already: with this one, not scaled yet, they make the update.
+                            L[update_target[pair]] -= mine * L[q]
+                            pair += 1
+                        L[update_target[pair]] -= mine * mine * scale
+                        pair += 1
+                        L[p] = mine * scale
+                    continue
                 for p in range(factor_indptr[j], factor_indptr[j + 1]):
                     for w in range(lanes):
                         total[w] = L[p * lanes + w] * inverse[w]
@@ -183,6 +195,22 @@ def _solver(lanes: int) -> Any:
                     for w in range(lanes):
                         sums[(p - start) * lanes + w] = 0.0
                 pair = update_start[j]
+                if lanes == 1:
+                    for p in range(start, stop):
+                        mine, sum_here = L[p], 0.0
+                        for q in range(start, p):
+                            z = Z[update_target[pair]]
+                            pair += 1
+                            sum_here += z * L[q]
+                            sums[q - start] += z * mine
+                        sums[p - start] += sum_here + Z[update_target[pair]] * mine
+                        pair += 1
+                    whole = 1.0 / L[below + j]
+                    for p in range(start, stop):
+                        Z[p] = -sums[p - start]
+                        whole += L[p] * sums[p - start]
+                    Z[below + j] = whole
+                    continue
                 for p in range(start, stop):
                     for q in range(start, p):
                         t = update_target[pair]

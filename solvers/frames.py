@@ -28,7 +28,7 @@ LANES = 8
 """Frames side by side in the compiled loop; a single frame has a loop of its own."""
 MOST_REFINEMENTS = 6
 TOO_WEAK = 1e11
-"""Trace of the scaled inverse above which the selected inverse has less than about five digits and the covariance is computed by refined solves."""
+"""Trace of the scaled inverse above which the selected inverse has fewer than about five digits; refined solves come in then."""
 MOST_ENTRIES = 6_000_000
 """Numbers of A that are held at a time; longer recordings are worked through in pieces."""
 
@@ -120,7 +120,9 @@ class FrameSolver:
         Insist on the compiled loop or on the one without; by default compiled where numba is installed.
     """
 
-    def __init__(self, pattern: LeastSquares, marginals: Sequence[IntArray] = (), compiled: bool | None = None) -> None:
+    def __init__(
+        self, pattern: LeastSquares, marginals: Sequence[IntArray] = (), compiled: bool | None = None
+    ) -> None:
         if pattern.constrained:
             raise SolverError("FrameSolver takes no constraints: use solve_frames with a QP solver")
         matrix = pattern.jacobian.matrix
@@ -148,7 +150,11 @@ class FrameSolver:
         started = time.perf_counter()
         count, size = rhs.shape[0], self.size
         if entries.shape[0] != count or rhs.shape[1] != self.rows:
-            raise InputError("frames", f"entries (n, nnz) and right-hand sides (n, {self.rows})", f"{entries.shape}, {rhs.shape}")
+            raise InputError(
+                "frames",
+                f"entries (n, nnz) and right-hand sides (n, {self.rows})",
+                f"{entries.shape}, {rhs.shape}",
+            )
         x = np.empty((count, size))
         variances = np.empty((count, size if covariance else 0))
         widths = [group.size**2 for group in self.marginals]
@@ -166,7 +172,7 @@ class FrameSolver:
             for end, width, group in zip(ends, widths, self.marginals, strict=True)
         ) if covariance else ()  # fmt: skip
         status, messages = [Status.SOLVED] * count, {}
-        for f in doubtful:
+        for f in map(int, doubtful):
             try:
                 x[f] = self._solve_carefully(entries[f], rhs[f])
                 if covariance:
@@ -178,14 +184,20 @@ class FrameSolver:
                     block[f] = np.nan
                 status[f], messages[int(f)] = Status.NUMERICAL_ERROR, str(error)
         elapsed = time.perf_counter() - started
-        return FrameResult(x, variances, blocks, tuple(status), messages, "cholesky", elapsed, int(doubtful.size))
+        return FrameResult(
+            x, variances, blocks, tuple(status), messages, "cholesky", elapsed, int(doubtful.size)
+        )
 
     def _solve_carefully(self, entries: FloatArray, rhs: FloatArray) -> FloatArray:
         if not np.isfinite(entries.sum() + rhs.sum()):
-            raise NotSolvedError("a row holds NaN or infinity where its value is no gap: the motion of this frame is incomplete")
+            raise NotSolvedError(
+                "a row holds NaN or infinity where its value is no gap: the motion of this frame is incomplete"
+            )
         if self._careful is None:
             self._careful = LinearSystem.of(self._pattern)
-        self._values = LinearValues(entries, rhs, self._pattern.equalities.matrix, self._pattern.equalities.rhs)
+        self._values = LinearValues(
+            entries, rhs, self._pattern.equalities.matrix, self._pattern.equalities.rhs
+        )
         self._careful.update(self._values)
         return self._careful.system.x
 
@@ -217,17 +229,24 @@ class _Plan:
         first = np.concatenate([one, np.arange(size), *(c[0] for c in cliques)])
         second = np.concatenate([other, np.arange(size), *(c[1] for c in cliques)])
         # A matrix that has the pattern and is safely positive definite, to learn order and fill from.
-        ones = sp.coo_array((np.ones(first.size), (np.minimum(first, second), np.maximum(first, second))), shape=(size, size))
+        ones = sp.coo_array(
+            (np.ones(first.size), (np.minimum(first, second), np.maximum(first, second))), shape=(size, size)
+        )
         upper = sp.csc_matrix(ones)
         upper.data[:] = 1.0
-        upper.setdiag(4.0 * np.bincount(np.concatenate([upper.indices, upper.nonzero()[1]]), minlength=size) + 1.0)
+        upper.setdiag(
+            4.0 * np.bincount(np.concatenate([upper.indices, upper.nonzero()[1]]), minlength=size) + 1.0
+        )
         upper.sort_indices()
         lower, _, order = qdldl.Solver(upper, upper=True).factors()
         pattern = sp.csc_array(lower)
         pattern.sort_indices()
         self._place = np.empty(size, dtype=np.int64)
         self._place[np.asarray(order)] = np.arange(size)
-        self._factor_indptr, self._factor_rows = pattern.indptr.astype(np.int64), pattern.indices.astype(np.int64)
+        self._factor_indptr, self._factor_rows = (
+            pattern.indptr.astype(np.int64),
+            pattern.indices.astype(np.int64),
+        )
         self._keys = np.repeat(np.arange(size), np.diff(self._factor_indptr)) * size + self._factor_rows
         self._gram_target = self._positions(self._place[one], self._place[other])
         a, b, starts = _column_pairs(self._factor_indptr)
@@ -237,10 +256,10 @@ class _Plan:
         self._pairs = np.concatenate(asked) if asked else np.empty(0, dtype=np.int64)
 
     def _positions(self, one: IntArray, other: IntArray) -> IntArray:
-        """Where the entries (one, other) of the symmetric matrix, in factor order, are kept: strictly lower ones first, then the diagonal."""
+        """Where the entries (one, other), in factor order, are kept: strictly lower ones first, then the diagonal."""
         low, high = np.minimum(one, other), np.maximum(one, other)
         at = np.searchsorted(self._keys, low * self.size + high)
-        return np.asarray(np.where(low == high, self._keys.size + low, at), dtype=np.int32)
+        return np.asarray(np.where(low == high, self._keys.size + low, at), dtype=np.uint32)
 
     def run(
         self, entries: FloatArray, rhs: FloatArray, covariance: bool,
@@ -263,7 +282,11 @@ def _column_pairs(indptr: IntArray) -> tuple[IntArray, IntArray, IntArray]:
     own = np.arange(number) - np.repeat(indptr[:-1], counts)
     p = np.repeat(np.arange(number), own + 1)
     before = np.concatenate([[0], np.cumsum(own + 1)])
-    q = np.repeat(np.repeat(indptr[:-1], counts), own + 1) + np.arange(p.size) - np.repeat(before[:-1], own + 1)
+    q = (
+        np.repeat(np.repeat(indptr[:-1], counts), own + 1)
+        + np.arange(p.size)
+        - np.repeat(before[:-1], own + 1)
+    )
     return p, q, before[indptr[:-1]]
 
 
@@ -327,7 +350,11 @@ def _all_at_once(problem: FrameProblem, covariance: bool) -> FrameResult:
 
 
 def _one_by_one(
-    problem: FrameProblem, first: LeastSquares, name: str | None, options: SolverOptions | None, covariance: bool
+    problem: FrameProblem,
+    first: LeastSquares,
+    name: str | None,
+    options: SolverOptions | None,
+    covariance: bool,
 ) -> FrameResult:
     from factorgrasp.solvers.solve import default_solver
 
@@ -357,4 +384,6 @@ def _one_by_one(
         if found.message and not found.status.ok:
             messages[f] = found.message
     elapsed = time.perf_counter() - started
-    return FrameResult(x, variances, blocks, tuple(status), messages, chosen.name, elapsed, 0, tuple(solutions))
+    return FrameResult(
+        x, variances, blocks, tuple(status), messages, chosen.name, elapsed, 0, tuple(solutions)
+    )

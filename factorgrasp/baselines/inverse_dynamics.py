@@ -41,7 +41,9 @@ class InverseDynamics:
     root_residual: FloatArray
 
 
-def inverse_dynamics(motion: LinkMotion, external_wrench: Mapping[str, ArrayLike] | None = None) -> InverseDynamics:
+def inverse_dynamics(
+    motion: LinkMotion, external_wrench: Mapping[str, ArrayLike] | None = None
+) -> InverseDynamics:
     """Joint wrenches from accelerations and measured external wrenches, bottom-up, all frames at once.
 
     Parameters
@@ -77,7 +79,13 @@ def inverse_dynamics(motion: LinkMotion, external_wrench: Mapping[str, ArrayLike
     )
 
 
-def rnea(model: Any, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, external_wrench: Mapping[str, ArrayLike] | None = None) -> FloatArray:
+def rnea(
+    model: Any,
+    q: ArrayLike,
+    qd: ArrayLike,
+    qdd: ArrayLike,
+    external_wrench: Mapping[str, ArrayLike] | None = None,
+) -> FloatArray:
     """Generalised forces (n, nv) by pinocchio's recursive Newton-Euler algorithm, with the model's own gravity.
 
     Parameters
@@ -109,7 +117,9 @@ def rnea(model: Any, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, external_wrenc
     return out
 
 
-def original_map(motion: LinkMotion, sensors: Sequence[Sensor], noise: HumanDynamicsNoise | None = None) -> HumanDynamics:
+def original_map(
+    motion: LinkMotion, sensors: Sequence[Sensor], noise: HumanDynamicsNoise | None = None
+) -> HumanDynamics:
     """Latella 2018: every link without a wrench sensor touches nothing, whatever the hands may carry."""
     return HumanDynamics(motion, sensors, noise or HumanDynamicsNoise.latella2018())
 

@@ -9,13 +9,13 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from factorgrasp.online.change_watch import DetectorSettings
+    from factorgrasp.online.change import DetectorSettings
     from factorgrasp.online.estimate import OnlineGraspEstimate, StreamCounts
     from factorgrasp.online.events import GraspEvent
     from factorgrasp.online.grasp import OnlineGraspPose
 
 _WHERE = {
-    "DetectorSettings": "change_watch",
+    "DetectorSettings": "change",
     "GraspEvent": "events",
     "OnlineGraspEstimate": "estimate",
     "OnlineGraspPose": "grasp",

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Literal
-
 import numpy as np
 
+from factorgrasp.online.change import Change, DetectorSettings
 from factorgrasp.online.coupled_rows import ACCELEROMETER, GYRO, shift_hand
 from factorgrasp.online.fitter import GraspFitter, columns_of
 from factorgrasp.online.jump_detector import GRASP, GUARD, REACH, STARTS, Jump, JumpDetector, Segments, explain
 from factorgrasp.online.moment_solver import Moment, batched_normals, local, retract
 from factorgrasp.online.row_history import RowHistory
+from factorgrasp.online.slow_watch import SlowWatch
 from factorgrasp.problems.grasp_model import GYRO_WIDTH, GraspModel
 from factorgrasp.typing import FloatArray, State
 
@@ -21,75 +20,10 @@ _SLIP_SHARE = 0.05
 _SHORTEST_SLIP = 20
 # Starts are all tried at every third segment, the newest ones at each.
 _FULL_TEST, _QUICK_STARTS = 3, 4
-# Soon after a change smaller ones count, by this factor.
-_ALERT = 0.3
+# Segments of a second, roughly.
+_SECOND = 25
 # A reference this far (tangent step) from the estimate before makes its snapshots worthless.
 _FAR = 0.2
-# Give of a firm hold, as part of the smallest change that is reported.
-_GIVE = 0.2
-
-
-@dataclass(frozen=True)
-class DetectorSettings:
-    """When a change of the grasp is reported.
-
-    Attributes
-    ----------
-    log_bayes_factor : float
-        Evidence that is needed.
-    smallest_angle, smallest_distance : float
-        rad and m; a change that is smaller in both is not reported. No hold is quite rigid: a fifth of them counts as its give.
-    """
-
-    log_bayes_factor: float = 15.0
-    smallest_angle: float = float(np.deg2rad(1.0))
-    smallest_distance: float = 0.008
-
-    @property
-    def give(self) -> FloatArray:
-        """Variances (6,) of the slight changes that are no event, rad^2 and m^2."""
-        return np.repeat([(_GIVE * self.smallest_angle) ** 2, (_GIVE * self.smallest_distance) ** 2], 3)
-
-    def reports(self, step: FloatArray) -> bool:
-        """Whether a change by `step` (6,) is large enough."""
-        angle, distance = np.linalg.norm(step[:3]), np.linalg.norm(step[3:])
-        return bool(angle >= self.smallest_angle or distance >= self.smallest_distance)
-
-    def alerted(self) -> DetectorSettings:
-        """After a change: what may be the rest of it counts although it is smaller."""
-        return replace(
-            self,
-            smallest_angle=_ALERT * self.smallest_angle,
-            smallest_distance=_ALERT * self.smallest_distance,
-        )
-
-
-@dataclass(frozen=True)
-class Change:
-    """A change of the grasp that was found.
-
-    Attributes
-    ----------
-    kind : {"regrasp", "slip"}
-    time : float
-        When it began (s, robot clock).
-    rows : int
-        Newest rows that belong to the grasp after.
-    before : State
-    before_covariance : (n, n) ndarray
-        Estimate from data before the change.
-    jump : Jump
-    large : bool
-        Above the smallest change that is reported when the grasp has not just changed.
-    """
-
-    kind: Literal["regrasp", "slip"]
-    time: float
-    rows: int
-    before: State
-    before_covariance: FloatArray
-    jump: Jump
-    large: bool
 
 
 class ChangeWatch:
@@ -113,10 +47,12 @@ class ChangeWatch:
         self._reference: State | None = None
         self._model: GraspModel = fitter.model
         self._detector = JumpDetector(fitter.model.size)
-        self._turn = 0
+        self._slow = SlowWatch(fitter, settings, segment * _SECOND)
+        self._turn = self._in_second = 0
 
     def add(self, rows: RowHistory) -> None:
         """A segment is complete: the newest window of two segment lengths."""
+        self._in_second += 1
         c = self._fitter.short.bank.coefficients(rows.last(2 * self._segment))
         self._coefficients.append(rows.last_times(1), c.reshape(1, -1), False)
         if self._reference is not None:
@@ -135,6 +71,9 @@ class ChangeWatch:
         level = self._fitter.level
         assert level is not None
         self._moments.append(np.array([time]), level.moment().to_row()[None], False)
+        if self._in_second == _SECOND:
+            self._in_second = 0
+            self._slow.remember(time)
 
     def refer(self) -> None:
         """Linearise at the present estimate, with its model and its weights."""
@@ -161,6 +100,7 @@ class ChangeWatch:
         short = self._fitter.short.bank
         shift_hand(self._coefficients.last(count).reshape(count, short.windowing.bins, 2, -1), shift)
         self._moment_shift(shift)
+        self._slow.shift_clock(shift)
         if self._reference is not None and "time_offset" in self._reference:
             self._reference = {**self._reference, "time_offset": self._reference["time_offset"] - shift}
 
@@ -183,6 +123,8 @@ class ChangeWatch:
         self._detector.forget()
         self._moments.run = 0
         self._reference = None
+        self._slow.restart()
+        self._in_second = 0
 
     def find(self, rows: RowHistory, alert: bool) -> Change | None:
         """A change of the grasp in the newest segments.
@@ -193,7 +135,12 @@ class ChangeWatch:
         alert : bool
             The grasp has just changed: smaller changes count, too, since they may be the rest of that one.
         """
-        settings = self._settings.alerted() if alert else self._settings
+        found = self._find_fast(rows, self._settings.alerted() if alert else self._settings)
+        if found is None and self._in_second == _SECOND:
+            return self._slow.add(float(rows.last_times(1)[0]), self._segment_moments(_SECOND))
+        return found
+
+    def _find_fast(self, rows: RowHistory, settings: DetectorSettings) -> Change | None:
         self._turn = (self._turn + 1) % _FULL_TEST
         starts = self._detector.starts(STARTS if self._turn == 0 else STARTS[:_QUICK_STARTS])
         if not starts:
@@ -204,20 +151,21 @@ class ChangeWatch:
         best, drift = self._detector.shapes(settings.give)
         margin = max(_SLIP_EVIDENCE, _SLIP_SHARE * best.evidence)
         slips = drift.segments >= _SHORTEST_SLIP and drift.evidence > best.evidence + margin
+        if not settings.reports(drift.step if slips else best.step):
+            return None
         sure = self._confirmed(best, settings)
         if sure is None:
             return None
         if slips:
             time, state, covariance = self._before(drift)
-            return Change("slip", time, max(best.segments // 2, 1) * self._segment, state, covariance, drift, self._settings.reports(drift.step))
+            kept = max(best.segments // 2, 1) * self._segment
+            return Change("slip", time, kept, state, covariance, drift, self._settings.reports(drift.step))
         _, state, covariance = self._before(best)
-        kept = self._since(rows, sure, state)
-        return Change("regrasp", float(rows.last_times(kept + 1)[0]), kept, state, covariance, sure, self._settings.reports(sure.step))
+        kept, large = self._since(rows, sure, state), self._settings.reports(sure.step)
+        return Change("regrasp", float(rows.last_times(kept + 1)[0]), kept, state, covariance, sure, large)
 
     def _confirmed(self, jump: Jump, settings: DetectorSettings) -> Jump | None:
-        """The jump, if it is large and convinces even where errors of the hand's sensors could explain the residuals instead."""
-        if not settings.reports(jump.step):
-            return None
+        """The jump, if it convinces even where errors of the hand's sensors could explain the residuals instead."""
         _, state, _ = self._before(jump)
         known = Moment.from_row(self._moments.last(jump.segments + GUARD)[0], self._fitter.long.bank.width)
         fit = self._fitter.with_sensor_errors(state, known)

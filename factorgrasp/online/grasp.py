@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from factorgrasp.errors import InputError
-from factorgrasp.online.change_watch import DetectorSettings
+from factorgrasp.online.change import DetectorSettings
 from factorgrasp.online.clock_start import Setup, analyse, coupler, enough, feed
 from factorgrasp.online.coupled_rows import Coupler
 from factorgrasp.online.estimate import OnlineGraspEstimate, StreamCounts

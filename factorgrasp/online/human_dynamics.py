@@ -1,6 +1,7 @@
 """Human dynamics frame by frame: everything that does not change is worked out once, a step fills in values and solves.
 
-Memory does not grow, and a step does no work that depends on how many came before. Without constraints a step is one factorisation; its time varies
+Memory does not grow, and a step does no work that depends on how many came before. Without constraints a step is one
+factorisation; its time varies
 by the number of refinements alone.
 """
 
@@ -23,6 +24,8 @@ from factorgrasp.problems.link_motion_pinocchio import PinocchioTree
 from factorgrasp.solvers.frames import FrameResult, FrameSolver
 from factorgrasp.status import Status
 from factorgrasp.typing import FloatArray
+
+Values = Mapping[str, ArrayLike] | FloatArray
 
 
 @dataclass(frozen=True)
@@ -87,21 +90,30 @@ class OnlineHumanDynamics:
         self.tree, self.covariance = tree, covariance
         one = []
         for sensor in sensors:
-            if sensor.variances().ndim > (2 if sensor.values.shape[0] == 1 else 1) and sensor.values.shape[0] > 1:
-                raise InputError(f"covariance of {sensor.name}", "one that does not change over frames", "one a frame")
+            C = sensor.variances()
+            if C.ndim == 3 or (C.ndim == 2 and C.shape != (sensor.size, sensor.size)):
+                raise InputError(
+                    f"covariance of {sensor.name}", "one that does not change over frames", "one a frame"
+                )
             one.append(replace(sensor, values=sensor.values[:1]))
         self.sensors = tuple(one)
         self.system = HumanDynamicsSystem(tree.tree, self.sensors, noise, contacts, use_motion)
         self._whitening = Whitening(self.system, self.sensors)
-        wanted = [*self.system.columns.joint_wrench, *self.system.columns.external_wrench] if covariance else []
+        wanted = (
+            [*self.system.columns.joint_wrench, *self.system.columns.external_wrench] if covariance else []
+        )
         self._solver = FrameSolver(self.system.pattern, wanted)
-        self._places = {sensor.name: where for sensor, where in zip(self.sensors, self.system.value_slices, strict=True)}
-        self._owner = np.concatenate([np.full(len(tree.tree.dofs[j]), j) for j in self.system.axes] or [np.empty(0)]).astype(np.intp)
+        self._places = {
+            sensor.name: where for sensor, where in zip(self.sensors, self.system.value_slices, strict=True)
+        }
+        self._owner = np.concatenate(
+            [np.full(len(tree.tree.dofs[j]), j) for j in self.system.axes] or [np.empty(0)]
+        ).astype(np.intp)
         self.frames = 0
         self.worst_latency = 0.0
 
     def step(
-        self, t: float, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, values: Mapping[str, ArrayLike]
+        self, t: float, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, values: Values
     ) -> HumanDynamicsFrame:
         """Estimate of one frame.
 
@@ -111,8 +123,9 @@ class OnlineHumanDynamics:
             s.
         q, qd, qdd : array_like
             In pinocchio's order.
-        values : mapping of str to (k,) array_like
-            Measurements by the sensor's name; a sensor that is not named, or NaN, has no rows in this frame.
+        values : mapping of str to (k,) array_like, or (m,) ndarray
+            Measurements by the sensor's name, or of all sensors one after another; a sensor that is not named, or NaN, has no
+            rows in this frame.
 
         Raises
         ------
@@ -122,21 +135,27 @@ class OnlineHumanDynamics:
         started = time.perf_counter()
         return self._finish(t, self.tree.kinematics(q, qd, qdd), values, started)
 
-    def step_links(self, t: float, kinematics: LinkKinematics, values: Mapping[str, ArrayLike]) -> HumanDynamicsFrame:
+    def step_links(self, t: float, kinematics: LinkKinematics, values: Values) -> HumanDynamicsFrame:
         """The same from kinematics of one frame, such as ``LinkMotion.kinematics(slice(k, k + 1))``."""
         if kinematics.count != 1:
             raise InputError("kinematics", "one frame", str(kinematics.count))
         return self._finish(t, kinematics, values, time.perf_counter())
 
-    def _finish(self, t: float, k: LinkKinematics, values: Mapping[str, ArrayLike], started: float) -> HumanDynamicsFrame:
+    def _finish(self, t: float, k: LinkKinematics, values: Values, started: float) -> HumanDynamicsFrame:
         rows = self._rows(values)
         entries, rhs = self.system.raw(k, rows)
         self._whitening.apply(entries, rhs, rows, slice(0, 1))
         result = self._solver.solve(entries, rhs, self.covariance)
         return self._read(t, k, result, started)
 
-    def _rows(self, values: Mapping[str, ArrayLike]) -> FloatArray:
+    def _rows(self, values: Values) -> FloatArray:
         size = self.system.value_slices[-1].stop if self.sensors else 0
+        if isinstance(values, np.ndarray):
+            if values.shape != (size,):
+                raise InputError(
+                    "values", f"shape ({size},) for all sensors one after another", str(values.shape)
+                )
+            return np.asarray(values, dtype=float)[None]
         out = np.full((1, size), np.nan)
         row = out[0]
         for name, value in values.items():
@@ -162,5 +181,13 @@ class OnlineHumanDynamics:
         latency = time.perf_counter() - started
         self.worst_latency = max(self.worst_latency, latency)
         return HumanDynamicsFrame(
-            float(t), torque, sd, x[columns.external_wrench], cov, wrench, result.status[0], result.messages.get(0, ""), latency
+            float(t),
+            torque,
+            sd,
+            x[columns.external_wrench],
+            cov,
+            wrench,
+            result.status[0],
+            result.messages.get(0, ""),
+            latency,
         )

@@ -97,8 +97,13 @@ class JumpDetector:
         self._segments.run = self._snapshots.run = 0
 
     def move(self, shift: FloatArray) -> None:
-        """The reference state moved by a tangent step (n,)."""
-        self._snapshots.last(self._snapshots.kept)[:, : self.size] -= shift
+        """The reference state moved by a tangent step (n,); segments and snapshots follow, to first order."""
+        n = self.size
+        self._snapshots.last(self._snapshots.kept)[:, :n] -= shift
+        rows = self._segments.last(self._segments.kept)
+        turned = rows[:, 2 + n :].reshape(-1, n, n) @ shift
+        rows[:, 0] += (rows[:, 2 : 2 + n] + 0.5 * turned) @ shift
+        rows[:, 2 : 2 + n] += turned
 
     def widened(self, where: FloatArray, size: int, variances: FloatArray) -> JumpDetector:
         """A detector for a model of `size` unknowns, in which those of this one stand at `where` and the new ones have prior `variances` (size,)."""

@@ -10,7 +10,8 @@ import numpy as np
 
 from factorgrasp import lie
 from factorgrasp.losses import make_loss
-from factorgrasp.online.change_watch import Change, ChangeWatch, DetectorSettings
+from factorgrasp.online.change import Change, DetectorSettings
+from factorgrasp.online.change_watch import ChangeWatch
 from factorgrasp.online.coupled_rows import ACCELEROMETER, GYRO, row_width, shift_hand
 from factorgrasp.online.events import GraspEvent
 from factorgrasp.online.fitter import GraspFitter

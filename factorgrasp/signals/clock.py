@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from factorgrasp.errors import InputError
 from factorgrasp.signals.resampling import GAP_IN_STEPS, resample_uniform
-from factorgrasp.typing import FloatArray
+from factorgrasp.typing import BoolArray, FloatArray
 
 # A source this much faster than the clock is averaged over the clock's step, not sampled: sampling would throw its other samples away and
 # fold what is above half the clock's rate into the result.
@@ -108,7 +108,8 @@ def _averaged(
     inside = index < t.size
     index = np.minimum(index, t.size - 1)
     inside &= np.abs(t[index] - points[:, None]) <= 0.5 * step * (1.0 + 1e-9)
-    inside &= np.isfinite(rows).all(axis=1)[index]
+    complete: BoolArray = np.asarray(np.isfinite(rows).all(axis=1))
+    inside &= complete[index]
     count = inside.sum(axis=1)
     weight = inside / np.maximum(count, 1)[:, None]
     away = t[index] - points[:, None]
@@ -124,4 +125,4 @@ def _averaged(
     nearest = np.where(inside, np.abs(away), np.inf).min(axis=1)
     lost = (count < max(_ENOUGH * step / own, 1.0)) | (nearest > 0.5 * longest)
     out[lost] = np.nan
-    return out[:, 0] if x.ndim == 1 else out
+    return np.asarray(out[:, 0] if x.ndim == 1 else out)

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from factorgrasp.errors import InputError
-from factorgrasp.models.anthropometry import ANKLE_HEIGHT, Sex
+from factorgrasp.models.anthropometry import Sex
 from factorgrasp.models.human import HumanBody, human_body
 from factorgrasp.models.joint_motion import differentiate_configurations
 from factorgrasp.problems.human_dynamics_sensors import Accelerometer, ExternalWrench, Sensor, plate_wrench
@@ -36,7 +36,6 @@ from factorgrasp.typing import BoolArray, FloatArray
 
 RATE = 100.0
 """Hz, of all that is recorded."""
-GRAVITY = 9.80665
 FEET = ("RightFoot", "LeftFoot")
 HANDS = ("RightHand", "LeftHand")
 IMU_LINKS = (
@@ -74,9 +73,9 @@ class HumanNoise:
 
     force: float = 2.0
     moment: float = 0.5
-    angle: float = 0.002
-    position: float = 0.0005
-    orientation: float = 0.002
+    angle: float = 0.001
+    position: float = 0.0003
+    orientation: float = 0.001
     accelerometer: float = 0.05
     hand_force: float = 0.5
     hand_moment: float = 0.05
@@ -492,12 +491,17 @@ def _record(
         external[link] = np.concatenate(
             [local, np.cross(np.broadcast_to(body.ends[link], local.shape), local)], axis=1
         )
-    torque, feet = _inverse_dynamics(
-        model, trajectory, motion, external, right_load, ANKLE_HEIGHT * body.height
-    )
+    torque, feet = _inverse_dynamics(model, trajectory, motion, external, right_load)
     names = tuple(str(n) for n in list(model.names)[2:])
     truth = HumanTruth(trajectory, model, torque, names, {**external, **feet}, motion, sum(held.values()))
     return HumanRecording(name, body, truth, noise or HumanNoise(), seed, phases)
+
+
+def inverse_dynamics(body: HumanBody, trajectory: JointTrajectory) -> FloatArray:
+    """Torques (n, 66) of a body by its equations of motion alone: the feet carry what they ask for, the hands nothing."""
+    model = body.model()
+    motion = PinocchioTree(model).motion(trajectory.t, trajectory.q, trajectory.v, trajectory.a)
+    return _inverse_dynamics(model, trajectory, motion, {}, None)[0]
 
 
 def _weight(motion: LinkMotion, link: str, mass: float, at: FloatArray) -> FloatArray:
@@ -517,7 +521,6 @@ def _inverse_dynamics(
     motion: LinkMotion,
     external: Mapping[str, FloatArray],
     right_load: FloatArray | None,
-    ankle_height: float,
 ) -> tuple[FloatArray, dict[str, FloatArray]]:
     """Joint torques (n, 66), and the wrenches on the feet in their frames that the equations of motion ask for.
 

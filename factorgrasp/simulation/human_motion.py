@@ -1,7 +1,7 @@
 """Motions of the body model for simulations: feet where they belong, the centre of mass where it should be, derivatives exact.
 
-Legs follow in closed form from the pelvis and the feet; all coordinates are then quintic splines through knots, so that positions, velocities
-and accelerations belong to each other to rounding.
+Legs follow in closed form from the pelvis and the feet; all coordinates are then quintic splines through knots, so that positions,
+velocities and accelerations belong to each other to rounding.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ def body(floating: bool = True, kinds: str = "ball") -> Any:
     root = 0
     if floating:
         root = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "root_joint")
-    inertia = lambda mass: pin.Inertia.FromBox(mass, 0.2, 0.3, 0.4)  # noqa: E731
+    inertia = lambda mass: pin.Inertia.FromBox(mass, 0.2, 0.3, 0.4)
 
     def place(x: float, y: float, z: float) -> Any:
         return pin.SE3(pin.exp3(0.2 * rng.standard_normal(3)), np.array([x, y, z]))
@@ -32,7 +32,9 @@ def body(floating: bool = True, kinds: str = "ball") -> Any:
     def ball(parent: int, name: str, at: Any) -> int:
         if kinds == "ball":
             return int(model.addJoint(parent, pin.JointModelSpherical(), at, name))
-        for axis, kind in zip("xyz", (pin.JointModelRX(), pin.JointModelRY(), pin.JointModelRZ()), strict=True):
+        for axis, kind in zip(
+            "xyz", (pin.JointModelRX(), pin.JointModelRY(), pin.JointModelRZ()), strict=True
+        ):
             parent = model.addJoint(parent, kind, at, f"{name}_{axis}")
             at = pin.SE3.Identity()
         return int(parent)
@@ -46,7 +48,12 @@ def body(floating: bool = True, kinds: str = "ball") -> Any:
         link(ball(shank, f"{side}_ankle", place(0.0, 0.0, -0.4)), f"{side}_foot", 1.1, -0.03)
         arm = link(ball(trunk, f"{side}_shoulder", place(0.0, 2 * y, 0.45)), f"{side}_arm", 2.0, -0.15)
         axis = np.array([0.1, 1.0, 0.2])
-        elbow = model.addJoint(arm, pin.JointModelRevoluteUnaligned(axis / np.linalg.norm(axis)), place(0.0, 0.0, -0.3), f"{side}_elbow")
+        elbow = model.addJoint(
+            arm,
+            pin.JointModelRevoluteUnaligned(axis / np.linalg.norm(axis)),
+            place(0.0, 0.0, -0.3),
+            f"{side}_elbow",
+        )
         link(elbow, f"{side}_hand", 1.5, -0.15)
     return model
 
@@ -56,11 +63,15 @@ def random_states(model: Any, count: int, seed: int = 0) -> tuple[FloatArray, Fl
     pin = pytest.importorskip("pinocchio")
     rng = np.random.default_rng(seed)
     v = rng.standard_normal((count, model.nv))
-    q = np.array([pin.integrate(model, pin.neutral(model), 0.6 * rng.standard_normal(model.nv)) for _ in range(count)])
+    q = np.array(
+        [pin.integrate(model, pin.neutral(model), 0.6 * rng.standard_normal(model.nv)) for _ in range(count)]
+    )
     return q, v, 3.0 * rng.standard_normal((count, model.nv))
 
 
-def smooth_states(model: Any, count: int, rate: float = 100.0, seed: int = 0) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+def smooth_states(
+    model: Any, count: int, rate: float = 100.0, seed: int = 0
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Times and consistent (q, qd, qdd) of gentle sines; only for models without a free-flyer or ball joints."""
     rng = np.random.default_rng(seed)
     t = np.arange(count) / rate
@@ -72,10 +83,14 @@ def smooth_states(model: Any, count: int, rate: float = 100.0, seed: int = 0) ->
 def random_wrenches(links: tuple[str, ...], count: int, seed: int = 1) -> dict[str, FloatArray]:
     """Wrenches (n, 6) of tens of newtons on every one of `links`."""
     rng = np.random.default_rng(seed)
-    return {link: rng.standard_normal((count, 6)) * np.array([40.0, 40.0, 40.0, 4.0, 4.0, 4.0]) for link in links}
+    return {
+        link: rng.standard_normal((count, 6)) * np.array([40.0, 40.0, 40.0, 4.0, 4.0, 4.0]) for link in links
+    }
 
 
-def standing(count: int = 40, seed: int = 0, carried: dict[str, FloatArray] | None = None) -> tuple[Any, dict[str, FloatArray]]:
+def standing(
+    count: int = 40, seed: int = 0, carried: dict[str, FloatArray] | None = None
+) -> tuple[Any, dict[str, FloatArray]]:
     """A floating body in random motion, with the wrenches on both feet that its motion and what it carries demand (shared at random)."""
     from dataclasses import replace
 

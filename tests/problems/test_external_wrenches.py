@@ -26,14 +26,18 @@ FEET = ("left_foot", "right_foot")
 SHARP = HumanDynamicsNoise(free_wrench=1e-6, contact_wrench=(1e5, 1e5, 1e5, 1e3, 1e3, 1e3))
 
 
-def carrying(mass: float, hands: tuple[str, ...], count: int = 30, seed: int = 0) -> tuple[LinkMotion, dict[str, FloatArray]]:
+def carrying(
+    mass: float, hands: tuple[str, ...], count: int = 30, seed: int = 0
+) -> tuple[LinkMotion, dict[str, FloatArray]]:
     """A payload shared by the hands, in random motion."""
     motion, _ = standing(count, seed)
     load = {}
     for hand in hands:
         i = motion.link(hand)
         force = mass / len(hands) * (motion.gravity - motion.acceleration[:, i])
-        load[hand] = np.concatenate([(np.swapaxes(motion.R[:, i], 1, 2) @ force[..., None])[..., 0], np.zeros((count, 3))], axis=1)
+        load[hand] = np.concatenate(
+            [(np.swapaxes(motion.R[:, i], 1, 2) @ force[..., None])[..., 0], np.zeros((count, 3))], axis=1
+        )
     return standing(count, seed, load)
 
 
@@ -56,12 +60,24 @@ def test_two_hands_at_rest_to_ten_grams() -> None:
     """Where both hands feel the same acceleration the total is exact, whatever the shares."""
     motion, wrenches = carrying(5.0, ("left_hand", "right_hand"))
     still = replace(
-        motion, acceleration=0.0 * motion.p, angular_acceleration=0.0 * motion.p, velocity=0.0 * motion.p, angular_velocity=0.0 * motion.p
+        motion,
+        acceleration=0.0 * motion.p,
+        angular_acceleration=0.0 * motion.p,
+        velocity=0.0 * motion.p,
+        angular_velocity=0.0 * motion.p,
     )
-    load = {h: np.concatenate([motion.R[:, motion.link(h)].swapaxes(1, 2) @ (2.5 * motion.gravity), np.zeros((30, 3))], axis=1) for h in ("left_hand", "right_hand")}
+    load = {
+        h: np.concatenate(
+            [motion.R[:, motion.link(h)].swapaxes(1, 2) @ (2.5 * motion.gravity), np.zeros((30, 3))], axis=1
+        )
+        for h in ("left_hand", "right_hand")
+    }
     wrenches = {**load, "left_foot": wrenches["left_foot"]}
     root = inverse_dynamics(still, wrenches).root_residual
-    sensors = [ExternalWrench(wrenches["left_foot"], 1e-6, link="left_foot"), ExternalWrench(root, 1e-6, link="pelvis")]
+    sensors = [
+        ExternalWrench(wrenches["left_foot"], 1e-6, link="left_foot"),
+        ExternalWrench(root, 1e-6, link="pelvis"),
+    ]
     found = ExternalWrenches(still, sensors, ("left_hand", "right_hand"), SHARP, 1e-6).estimate().payload()
     assert np.abs(found.mass - 5.0).max() < 0.01
 
@@ -73,9 +89,13 @@ def test_closed_form_equals_a_general_solver() -> None:
     sensors = feet(wrenches, C)
     sensors[1].values[2, :4] = np.nan
     world = motion.R[:, motion.link("left_foot")]
-    turned = np.concatenate([(world @ wrenches["left_foot"][:, s, None])[..., 0] for s in (slice(0, 3), slice(3, 6))], axis=1)
+    turned = np.concatenate(
+        [(world @ wrenches["left_foot"][:, s, None])[..., 0] for s in (slice(0, 3), slice(3, 6))], axis=1
+    )
     sensors[0] = ExternalWrench(turned, C, link="left_foot", frame="world")
-    problem = ExternalWrenches(motion, sensors, ("left_hand", "right_hand"), HumanDynamicsNoise(free_wrench=1e-2))
+    problem = ExternalWrenches(
+        motion, sensors, ("left_hand", "right_hand"), HumanDynamicsNoise(free_wrench=1e-2)
+    )
     found = problem.estimate()
     for f in (1, 2):
         one = solve(problem.frame(f))
@@ -91,7 +111,12 @@ def test_the_full_momentum_rate_is_needed() -> None:
     motion, wrenches = standing(20, carried=random_wrenches(("left_hand",), 20))
     found = ExternalWrenches(motion, feet(wrenches), ("left_hand",), SHARP, 1e-6).estimate()
     assert np.abs(found.of("left_hand") - wrenches["left_hand"]).max() < 0.01
-    still = replace(motion, acceleration=0.0 * motion.p, angular_acceleration=0.0 * motion.p, angular_velocity=0.0 * motion.p)
+    still = replace(
+        motion,
+        acceleration=0.0 * motion.p,
+        angular_acceleration=0.0 * motion.p,
+        angular_velocity=0.0 * motion.p,
+    )
     weight_only = ExternalWrenches(still, feet(wrenches), ("left_hand",), SHARP, 1e-6).estimate()
     assert np.sqrt(np.mean((weight_only.of("left_hand") - wrenches["left_hand"])[:, :3] ** 2)) > 10.0
 
@@ -111,7 +136,12 @@ def test_consistent_with_noise() -> None:
     motion.__dict__["momentum_rate"] = shifted
     found = problem.estimate()
     error = np.concatenate([found.of(hand) - wrenches[hand] for hand in hands], axis=1)
-    nees = np.einsum("ni,ni->n", error, np.linalg.solve(found.joint_covariance(hands), error[..., None])[..., 0]).mean() / 12.0
+    nees = (
+        np.einsum(
+            "ni,ni->n", error, np.linalg.solve(found.joint_covariance(hands), error[..., None])[..., 0]
+        ).mean()
+        / 12.0
+    )
     low, high = nees_band(12, n)
     assert low < nees < high
     low, high = nees_band(6, n)
@@ -128,7 +158,8 @@ def test_what_six_equations_cannot_tell_apart_is_said() -> None:
     missing = [d.words for d in found.missing]
     assert any("squeeze between left_hand and right_hand" in words for words in missing)
     assert not any(words.startswith("total force") for words in missing)
-    assert "wrench sensor" in found.advice and "not informed" in two.summary()
+    assert "wrench sensor" in found.advice
+    assert "not informed" in two.summary()
 
 
 def test_chained_and_joint_estimates() -> None:
@@ -159,7 +190,11 @@ def test_a_wrong_mass_is_said() -> None:
 def test_bad_input_is_named() -> None:
     """What is wrong and what was expected."""
     motion, wrenches = standing(3)
-    for contacts, words in (((), "at least one"), (("tail",), "links among"), (("left_foot",), "without a wrench sensor")):
+    for contacts, words in (
+        ((), "at least one"),
+        (("tail",), "links among"),
+        (("left_foot",), "without a wrench sensor"),
+    ):
         with pytest.raises(InputError, match=words):
             ExternalWrenches(motion, feet(wrenches), contacts)
     with pytest.raises(InputError, match="payload"):

@@ -51,7 +51,8 @@ def test_noise_free_torques_equal_rnea(floating: bool, kinds: str) -> None:
     sensors.append(ExternalWrench(root, 1e-6, link="pelvis"))
     motion = from_pinocchio(model, np.arange(float(n)), q, v, a)
     estimate = solve_frames(HumanDynamics(motion, sensors, TIGHT))
-    assert estimate.solved and len(estimate.dof_names) == 25 - 6 + 6
+    assert estimate.solved
+    assert len(estimate.dof_names) == 25 - 6 + 6
     assert np.abs(estimate.torque - tau[:, 6 if floating else 0 :]).max() < 1e-4
     assert np.all(estimate.torque_sd > 0.0)
 
@@ -59,7 +60,9 @@ def test_noise_free_torques_equal_rnea(floating: bool, kinds: str) -> None:
 def test_a_single_frame_takes_any_solver_and_agrees() -> None:
     """The general solvers and the fast one for many frames: same means, same sd, same innovations."""
     motion, wrenches = standing(5)
-    sensors = [ExternalWrench(w + 0.3, np.diag(np.full(6, 0.5)) + 0.1, link=link) for link, w in wrenches.items()]
+    sensors = [
+        ExternalWrench(w + 0.3, np.diag(np.full(6, 0.5)) + 0.1, link=link) for link, w in wrenches.items()
+    ]
     problem = HumanDynamics(motion, sensors, contacts=("left_hand",))
     many = solve_frames(problem)
     for name in ("cholesky", "gtsam"):
@@ -67,7 +70,9 @@ def test_a_single_frame_takes_any_solver_and_agrees() -> None:
         assert np.allclose(one.torque[0], many.torque[3], atol=1e-7)
         assert np.allclose(one.torque_sd[0], many.torque_sd[3], rtol=1e-6)
         assert np.allclose(one.innovations[0].nis, many.innovations[0].nis[3], rtol=1e-4)
-    slow = FrameSolver(problem.pattern, problem.marginals, compiled=False).solve(*problem.whitened_frames(slice(0, 2)))
+    slow = FrameSolver(problem.pattern, problem.marginals, compiled=False).solve(
+        *problem.whitened_frames(slice(0, 2))
+    )
     fast = FrameSolver(problem.pattern, problem.marginals).solve(*problem.whitened_frames(slice(0, 2)))
     assert np.allclose(slow.x, fast.x, atol=1e-7)
     assert np.allclose(slow.variances, fast.variances, rtol=1e-6)
@@ -85,17 +90,22 @@ def test_every_sensor_is_exact_at_the_truth() -> None:
     point = motion.p[:, trunk] + motion.R[:, trunk] @ p
     w, dw = motion.angular_velocity[:, trunk], motion.angular_acceleration[:, trunk]
     arm = point - motion.p[:, trunk]
-    specific = motion.acceleration[:, trunk] + np.cross(dw, arm) + np.cross(w, np.cross(w, arm)) - motion.gravity
+    specific = (
+        motion.acceleration[:, trunk] + np.cross(dw, arm) + np.cross(w, np.cross(w, arm)) - motion.gravity
+    )
     into = np.swapaxes(motion.R[:, trunk] @ R, 1, 2)
     foot = motion.link("left_foot")
     world = motion.R[:, foot] @ wrenches["left_foot"].reshape(n, 2, 3).swapaxes(1, 2)
     free = rng.standard_normal((n, 3))
     force, moment = world[..., 0], world[..., 1]
     # A centre of pressure for which plate_wrench must give the moment back: M - free perpendicular to the force is needed.
-    across = moment - np.sum(moment * force, axis=1, keepdims=True) * force / np.sum(force**2, axis=1, keepdims=True)
+    across = moment - np.sum(moment * force, axis=1, keepdims=True) * force / np.sum(
+        force**2, axis=1, keepdims=True
+    )
     at = motion.p[:, foot] + np.cross(force, across) / np.sum(force**2, axis=1, keepdims=True)
     plate = plate_wrench(force, at, moment - across, motion.p[:, foot])
-    assert np.allclose(plate[:, 3:], moment) and free.shape == (n, 3)
+    assert np.allclose(plate[:, 3:], moment)
+    assert free.shape == (n, 3)
     right = wrenches["right_foot"]
     shifted = np.concatenate([right[:, :3] @ R, (right[:, 3:] - np.cross(p, right[:, :3])) @ R], axis=1)
     k = motion.kinematics()
@@ -159,7 +169,8 @@ def test_a_gap_in_the_motion_is_said_and_stays_one_frame() -> None:
     p = motion.p.copy()
     p[5, 2] = np.nan
     found = solve_frames(HumanDynamics(replace(motion, p=p), sensors))
-    assert found.status[5] is Status.NUMERICAL_ERROR and "motion of this frame" in found.messages[5]
+    assert found.status[5] is Status.NUMERICAL_ERROR
+    assert "motion of this frame" in found.messages[5]
     assert np.isnan(found.torque[5]).all()
     keep = np.arange(12) != 5
     assert np.allclose(found.torque[keep], whole.torque[keep], atol=1e-8)
@@ -167,9 +178,18 @@ def test_a_gap_in_the_motion_is_said_and_stays_one_frame() -> None:
 
 def test_consistent_over_seeds() -> None:
     """NEES of torques and of an unmeasured hand's wrench inside the 95 % band; NIS as well."""
-    motion, wrenches = standing(60, seed=3, carried={"left_hand": random_wrenches(("left_hand",), 60, 9)["left_hand"]})
+    motion, wrenches = standing(
+        60, seed=3, carried={"left_hand": random_wrenches(("left_hand",), 60, 9)["left_hand"]}
+    )
     truth = inverse_dynamics(motion, wrenches)
-    noise = HumanDynamicsNoise(1e-3, 1e-2, 1e-2, contact_wrench=[1600.0] * 3 + [16.0] * 3, joint_acceleration=0.25, link_acceleration=0.04)
+    noise = HumanDynamicsNoise(
+        1e-3,
+        1e-2,
+        1e-2,
+        contact_wrench=[1600.0] * 3 + [16.0] * 3,
+        joint_acceleration=0.25,
+        link_acceleration=0.04,
+    )
     rng = np.random.default_rng(4)
     n, foot_sd = len(motion), np.array([1.0, 1.0, 2.0, 0.3, 0.3, 0.2])
     tree, k = motion.tree, motion.kinematics()
@@ -187,7 +207,9 @@ def test_consistent_over_seeds() -> None:
         )  # fmt: skip
     from factorgrasp.problems.link_motion_spatial import cross_force
 
-    net = (tree.spatial_inertia @ alpha[..., None])[..., 0] + cross_force(k.velocity, (tree.spatial_inertia @ k.velocity[..., None])[..., 0])
+    net = (tree.spatial_inertia @ alpha[..., None])[..., 0] + cross_force(
+        k.velocity, (tree.spatial_inertia @ k.velocity[..., None])[..., 0]
+    )
     net += np.sqrt(1e-2) * rng.standard_normal(net.shape)
     fx["left_foot"] = wrenches["left_foot"]
     for i, link in enumerate(motion.links):
@@ -209,16 +231,24 @@ def test_consistent_over_seeds() -> None:
         down = np.linalg.solve(np.swapaxes(k.transform[:, j], 1, 2), down[..., None])[..., 0]
         f[:, j] -= down
     fx["right_foot"] = down
-    torque = np.concatenate([(np.swapaxes(k.subspaces[j], 1, 2) @ f[:, j, :, None])[..., 0] for j in range(len(tree.joints))], axis=1)
+    torque = np.concatenate(
+        [(np.swapaxes(k.subspaces[j], 1, 2) @ f[:, j, :, None])[..., 0] for j in range(len(tree.joints))],
+        axis=1,
+    )
     assert np.abs(torque - truth.torque).max() < 20.0
     # What is measured.
-    from factorgrasp.problems.link_motion import LinkJoint  # noqa: F401
-
-    sensors = [ExternalWrench(fx[link] + foot_sd * rng.standard_normal((n, 6)), foot_sd**2, link=link) for link in ("left_foot", "right_foot")]
+    sensors = [
+        ExternalWrench(fx[link] + foot_sd * rng.standard_normal((n, 6)), foot_sd**2, link=link)
+        for link in ("left_foot", "right_foot")
+    ]
     for j, joint in enumerate(tree.joints):
         part = qdd[:, first[j] : first[j + 1]]
         sensors.append(JointAcceleration(part + 0.5 * rng.standard_normal(part.shape), 0.25, joint=joint))
-    sensors.append(LinkAcceleration(alpha[:, motion.root] + 0.2 * rng.standard_normal((n, 6)), 0.04, link=motion.links[motion.root]))
+    sensors.append(
+        LinkAcceleration(
+            alpha[:, motion.root] + 0.2 * rng.standard_normal((n, 6)), 0.04, link=motion.links[motion.root]
+        )
+    )
     estimate = solve_frames(HumanDynamics(motion, sensors, noise, contacts=("left_hand",)))
     low, high = nees_band(1, torque.shape[1] * n)
     total = 0.0
@@ -245,7 +275,10 @@ def test_innovations_find_the_sensor_that_is_mistuned() -> None:
     sd = np.array([2.0, 2.0, 2.0, 0.4, 0.4, 0.4])
     left = wrenches["left_foot"] + sd * rng.standard_normal((300, 6))
     right = wrenches["right_foot"] + 0.1 * rng.standard_normal((300, 6))
-    sensors = [ExternalWrench(left, (sd / 10.0) ** 2, link="left_foot"), ExternalWrench(right, 0.01, link="right_foot")]
+    sensors = [
+        ExternalWrench(left, (sd / 10.0) ** 2, link="left_foot"),
+        ExternalWrench(right, 0.01, link="right_foot"),
+    ]
     problem = HumanDynamics(motion, sensors, TIGHT)
     estimate = solve_frames(problem)
     assert estimate.innovations[0].ratio > 10.0
@@ -278,12 +311,16 @@ def test_covariances_over_twelve_orders(model_variance: float) -> None:
     """From nearly exact dynamics to loose ones: the same as a dense solution through singular values."""
     motion, wrenches = standing(2)
     sensors = [ExternalWrench(w, 1.0, link=link) for link, w in wrenches.items()]
-    problem = HumanDynamics(motion, sensors, replace(TIGHT, propagation=model_variance, balance=model_variance))
+    problem = HumanDynamics(
+        motion, sensors, replace(TIGHT, propagation=model_variance, balance=model_variance)
+    )
     estimate = solve_frames(problem)
     A, b = problem.frame(1).whitened()
     x, *_ = np.linalg.lstsq(A.toarray(), b, rcond=1e-18)
     assert estimate.solved
-    assert np.allclose(estimate.joint_wrench[1].ravel(), x[problem.system.columns.joint_wrench.ravel()], atol=1e-4)
+    assert np.allclose(
+        estimate.joint_wrench[1].ravel(), x[problem.system.columns.joint_wrench.ravel()], atol=1e-4
+    )
     # Variances through the inverse of R of a QR, which squares nothing.
     inverse = np.linalg.inv(np.linalg.qr(A.toarray(), mode="r"))
     sd = np.sqrt(np.sum(inverse**2, axis=1))[problem.system.columns.joint_wrench.ravel()]
@@ -299,13 +336,16 @@ def test_equal_to_idyntree() -> None:
     import sys
 
     spec = importlib.util.spec_from_file_location("idyntree_peer", path)
-    assert spec is not None and spec.loader is not None
+    assert spec is not None
+    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules["idyntree_peer"] = module
     spec.loader.exec_module(module)
     urdf = _chain_urdf()
     placed = {"imu": ("l3", pin.exp3(np.array([0.3, -0.2, 0.5])), np.array([0.1, 0.05, 0.2]))}
-    peer = module.IDynTreePeer(urdf, placed, module.PeerCovariances(wrench_default=[1.0, 2.0, 3.0, 0.1, 0.2, 0.3]), "l0")
+    peer = module.IDynTreePeer(
+        urdf, placed, module.PeerCovariances(wrench_default=[1.0, 2.0, 3.0, 0.1, 0.2, 0.3]), "l0"
+    )
     model = pin.buildModelFromXML(urdf, pin.JointModelFreeFlyer())
     rng = np.random.default_rng(0)
     q, qd, y = 0.5 * rng.standard_normal(4), rng.standard_normal(4), 10.0 * rng.standard_normal(peer.measured)
@@ -316,9 +356,22 @@ def test_equal_to_idyntree() -> None:
     d, _ = peer.estimate(q[where], qd[where], rate, y)
     tree = PinocchioTree(model, gravity=(0.0, 0.0, -9.81))
     motion = tree.motion([0.0], np.r_[np.zeros(6), 1.0, q], np.r_[np.zeros(3), rate, qd], np.zeros(10))
-    sensors = [Accelerometer(y[None, peer.ranges["accelerometer", "imu"]], 1e-3, link="l3", R_l_s=placed["imu"][1], p_l_s=placed["imu"][2])]
-    sensors += [ExternalWrench(y[None, peer.ranges["wrench", l]], [1.0, 2.0, 3.0, 0.1, 0.2, 0.3], link=l) for l in motion.links]  # noqa: E741
-    sensors += [JointAcceleration(y[None, peer.ranges["joint", j.name]], 1e-3, joint=j.name) for j in motion.joints]
+    sensors = [
+        Accelerometer(
+            y[None, peer.ranges["accelerometer", "imu"]],
+            1e-3,
+            link="l3",
+            R_l_s=placed["imu"][1],
+            p_l_s=placed["imu"][2],
+        )
+    ]
+    sensors += [
+        ExternalWrench(y[None, peer.ranges["wrench", link]], [1.0, 2.0, 3.0, 0.1, 0.2, 0.3], link=link)
+        for link in motion.links
+    ]
+    sensors += [
+        JointAcceleration(y[None, peer.ranges["joint", j.name]], 1e-3, joint=j.name) for j in motion.joints
+    ]
     found = solve_frames(HumanDynamics(motion, sensors, HumanDynamicsNoise(1e-4, 1e-4), use_motion=False))
     place = peer.unknowns()
     for j, joint in enumerate(motion.joints):
@@ -328,8 +381,8 @@ def test_equal_to_idyntree() -> None:
 
 
 def _chain_urdf() -> str:
-    link = '<link name="l{i}"><inertial><mass value="{m}"/><origin xyz="0.02 0.01 0.2" rpy="0 0 0"/><inertia ixx="0.2" iyy="0.25" izz="0.1" ixy="0.01" ixz="0" iyz="0"/></inertial></link>'  # noqa: E501
-    joint = '<joint name="j{i}" type="revolute"><parent link="l{p}"/><child link="l{i}"/><origin xyz="0.05 0 0.4" rpy="0.2 0.1 0"/><axis xyz="{a}"/><limit effort="9" velocity="9" lower="-9" upper="9"/></joint>'  # noqa: E501
+    link = '<link name="l{i}"><inertial><mass value="{m}"/><origin xyz="0.02 0.01 0.2" rpy="0 0 0"/><inertia ixx="0.2" iyy="0.25" izz="0.1" ixy="0.01" ixz="0" iyz="0"/></inertial></link>'
+    joint = '<joint name="j{i}" type="revolute"><parent link="l{p}"/><child link="l{i}"/><origin xyz="0.05 0 0.4" rpy="0.2 0.1 0"/><axis xyz="{a}"/><limit effort="9" velocity="9" lower="-9" upper="9"/></joint>'
     parts = [link.format(i=i, m=3.0 + i) for i in range(5)]
     axes = ("0 1 0", "1 0 0", "0 0 1", "0 1 0")
     parts += [joint.format(i=i, p=(0, 1, 2, 1)[i - 1], a=axes[i - 1]) for i in range(1, 5)]
@@ -339,20 +392,42 @@ def _chain_urdf() -> str:
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda m, n: HumanDynamics(m, [ExternalWrench(np.zeros((n, 6)), 1.0, link="tail")]), "link of external wrench of tail"),
-        (lambda m, n: HumanDynamics(m, [ExternalWrench(np.zeros((n + 1, 6)), 1.0, link="pelvis")]), "frames of the motion"),
+        (
+            lambda m, n: HumanDynamics(m, [ExternalWrench(np.zeros((n, 6)), 1.0, link="tail")]),
+            "link of external wrench of tail",
+        ),
+        (
+            lambda m, n: HumanDynamics(m, [ExternalWrench(np.zeros((n + 1, 6)), 1.0, link="pelvis")]),
+            "frames of the motion",
+        ),
         (lambda m, n: HumanDynamics(m, contacts=("tail",)), "contacts"),
-        (lambda m, n: HumanDynamics(m, [ExternalWrench(np.zeros((n, 6)), 1.0, link="left_hand")], contacts=("left_hand",)), "contacts"),
+        (
+            lambda m, n: HumanDynamics(
+                m, [ExternalWrench(np.zeros((n, 6)), 1.0, link="left_hand")], contacts=("left_hand",)
+            ),
+            "contacts",
+        ),
         (lambda m, n: ExternalWrench(np.zeros((n, 5)), 1.0, link="pelvis"), "shape"),
         (lambda m, n: ExternalWrench(np.zeros((n, 6)), -1.0, link="pelvis"), "variances above zero"),
         (lambda m, n: ExternalWrench(np.full((n, 6), np.inf), 1.0, link="pelvis"), "NaN for gaps"),
         (lambda m, n: ExternalWrench(np.zeros((n, 6)), np.ones((6, 6)), link="pelvis"), "positive definite"),
         (lambda m, n: HumanDynamics(m, [JointTorque(np.zeros((n, 2)), 1.0, joint="left_knee")]), "1 columns"),
         (lambda m, n: HumanDynamics(m, [JointTorque(np.zeros((n, 1)), 1.0, joint="left_kne")]), "joint of"),
-        (lambda m, n: HumanDynamics(m, noise=HumanDynamicsNoise(propagation={"spine": 1.0})), "propagation variance"),
+        (
+            lambda m, n: HumanDynamics(m, noise=HumanDynamicsNoise(propagation={"spine": 1.0})),
+            "propagation variance",
+        ),
         (lambda m, n: HumanDynamics(m, noise=HumanDynamicsNoise(balance=0.0)), "balance variance"),
-        (lambda m, n: HumanDynamics(m, [Accelerometer(np.zeros((n, 3)), 1.0, link="trunk", R_l_s=2 * np.eye(3))]), "R_l_s"),
-        (lambda m, n: HumanDynamics(m, [Accelerometer(np.zeros((n, 3)), 1.0, link="trunk")] * 2), "unique names"),
+        (
+            lambda m, n: HumanDynamics(
+                m, [Accelerometer(np.zeros((n, 3)), 1.0, link="trunk", R_l_s=2 * np.eye(3))]
+            ),
+            "R_l_s",
+        ),
+        (
+            lambda m, n: HumanDynamics(m, [Accelerometer(np.zeros((n, 3)), 1.0, link="trunk")] * 2),
+            "unique names",
+        ),
         (lambda m, n: HumanDynamics(m).least_squares(), "one frame"),
     ],
 )

@@ -29,7 +29,9 @@ pytest.importorskip("piqp")
 NOISE = HumanDynamicsNoise(1e-3, 1e-3, 1e-3)
 
 
-def problem(*constraints: DynamicsConstraint, hard: bool = False, foot: object = None, count: int = 2) -> HumanDynamics:
+def problem(
+    *constraints: DynamicsConstraint, hard: bool = False, foot: object = None, count: int = 2
+) -> HumanDynamics:
     """Noisy plates under both feet, loose enough for a constraint to move them."""
     motion, wrenches = standing(count)
     values = dict(wrenches)
@@ -48,7 +50,9 @@ def test_a_foot_does_not_pull() -> None:
     pull = np.array([0.0, 0.0, -60.0, 0.0, 0.0, 0.0])
     free = solve_frames(problem(foot=pull))
     held = solve_frames(problem(UnilateralContact("left_foot"), foot=pull))
-    assert free.solved and held.solved and held.solver == "piqp"
+    assert free.solved
+    assert held.solved
+    assert held.solver == "piqp"
     assert np.all(wrench_of_foot(free)[:, 2] < -1.0)
     assert np.allclose(wrench_of_foot(held)[:, 2], 0.0, atol=1e-6)
     assert {a.name for a in held.active} == {"unilateral contact of left_foot"}
@@ -66,11 +70,17 @@ def test_friction_and_sole() -> None:
     w = wrench_of_foot(held)
     force = w[:, :3] @ R
     assert np.all(np.linalg.norm(force[:, :2], axis=1) <= 0.5 * force[:, 2] + 1e-6)
-    assert np.any(np.linalg.norm(force[:, :2], axis=1) > 0.9 * 0.5 * force[:, 2] * np.cos(np.pi / friction.sides))
+    assert np.any(
+        np.linalg.norm(force[:, :2], axis=1) > 0.9 * 0.5 * force[:, 2] * np.cos(np.pi / friction.sides)
+    )
     moment = (w[:, 3:] - np.cross(p, w[:, :3])) @ R
     pressure = np.stack([-moment[:, 1], moment[:, 0]], axis=1) / force[:, [2]]
-    low, high = CentreOfPressure("left_foot").corners.min(axis=0), CentreOfPressure("left_foot").corners.max(axis=0)
-    assert np.all(pressure > low - 1e-6) and np.all(pressure < high + 1e-6)
+    low, high = (
+        CentreOfPressure("left_foot").corners.min(axis=0),
+        CentreOfPressure("left_foot").corners.max(axis=0),
+    )
+    assert np.all(pressure > low - 1e-6)
+    assert np.all(pressure < high + 1e-6)
     assert any("friction limit" in a.words for a in held.active)
 
 
@@ -95,7 +105,8 @@ def test_torque_limits_and_what_their_multiplier_means() -> None:
         x = np.concatenate([
             found.acceleration.ravel(), found.external_wrench.ravel(), found.joint_wrench.ravel(), found.joint_acceleration.ravel()
         ])  # fmt: skip
-        assert x.size == system.size and columns.joint_wrench.max() < x.size
+        assert x.size == system.size
+        assert columns.joint_wrench.max() < x.size
         return system.objective(x)
 
     slope = (cost(limit - 0.01) - cost(limit + 0.01)) / 0.02
@@ -115,12 +126,16 @@ def test_hard_dynamics() -> None:
     """As equality constraints: what tiny variances tend to, and exact."""
     hard = solve_frames(problem(hard=True))
     tight = problem()
-    soft = solve_frames(HumanDynamics(tight.motion, tight.sensors, replace(NOISE, propagation=1e-9, balance=1e-9)))
-    assert hard.solved and hard.solver == "kkt"
+    soft = solve_frames(
+        HumanDynamics(tight.motion, tight.sensors, replace(NOISE, propagation=1e-9, balance=1e-9))
+    )
+    assert hard.solved
+    assert hard.solver == "kkt"
     assert np.allclose(hard.torque, soft.torque, atol=1e-3)
     assert np.allclose(hard.torque_sd, soft.torque_sd, rtol=1e-3)
     both = solve_frames(problem(TorqueLimit("left_knee", -5.0, 5.0), hard=True))
-    assert both.solved and np.all(np.abs(both.torque[:, both.dof_names.index("left_knee")]) < 5.0 + 1e-5)
+    assert both.solved
+    assert np.all(np.abs(both.torque[:, both.dof_names.index("left_knee")]) < 5.0 + 1e-5)
 
 
 def test_bad_constraints_are_named() -> None:
@@ -131,7 +146,10 @@ def test_bad_constraints_are_named() -> None:
         (lambda: problem(TorqueLimit("left_knee", 1.0, -1.0)), "lower <= upper"),
         (lambda: problem(TorqueLimit("spine", [-1.0, -1.0], 1.0)), "3 limits"),
         (lambda: FrictionPyramid("left_foot", friction=0.0), "coefficient above zero"),
-        (lambda: CentreOfPressure("left_foot", corners=np.array([[0.0, 0.0], [0.0, 1.0], [1.0, 0.0]])), "counter-clockwise"),
+        (
+            lambda: CentreOfPressure("left_foot", corners=np.array([[0.0, 0.0], [0.0, 1.0], [1.0, 0.0]])),
+            "counter-clockwise",
+        ),
     ):
         with pytest.raises(InputError, match=words):
             make()

@@ -33,7 +33,9 @@ def plates(path: Path, motion: LinkMotion) -> list[ExternalWrench]:
             if np.any(grf):
                 origin = motion.p[:, motion.link(str(link))]
                 values = plate_wrench(grf[:, :3], grf[:, 3:6], grf[:, 6:], origin)
-                out.append(ExternalWrench(values, PLATE, link=str(link), frame="world", name=f"plate under {link}"))
+                out.append(
+                    ExternalWrench(values, PLATE, link=str(link), frame="world", name=f"plate under {link}")
+                )
     return out
 
 
@@ -47,7 +49,8 @@ def test_bowing_with_the_authors_covariances(dataset: Find) -> None:
     tree = PinocchioTree(pin.buildModelFromUrdf(str(urdf)))
     n = joints.q.shape[1]
     motion = tree.motion(np.arange(n) * 0.01, joints.q.T, joints.dq.T, joints.ddq.T)
-    assert motion.base == "fixed" and motion.links == ("foot", "leg", "torso")
+    assert motion.base == "fixed"
+    assert motion.links == ("foot", "leg", "torso")
     measured = [
         Accelerometer(sensors.acc.T, 0.001111, link="torso", R_l_s=place[:3, :3], p_l_s=place[:3, 3]),
         ExternalWrench(sensors.fts_footFrame.T, [59.0, 59.0, 36.0, 2.25, 2.25, 0.56], link="foot"),
@@ -59,9 +62,11 @@ def test_bowing_with_the_authors_covariances(dataset: Find) -> None:
     # Top-down (motion alone) and the MAP agree within what the plate can move them.
     top_down = inverse_dynamics(motion).torque
     rms = np.sqrt(np.mean((estimate.torque - top_down) ** 2, axis=0))
-    assert rms[1] < 1.5 and rms[0] < 7.0
+    assert rms[1] < 1.5
+    assert rms[0] < 7.0
     assert np.ptp(estimate.torque[:, 0]) > 50.0
-    assert np.all(estimate.torque_sd[:, 0] < 0.7) and np.all(estimate.torque_sd[:, 1] < 0.2)
+    assert np.all(estimate.torque_sd[:, 0] < 0.7)
+    assert np.all(estimate.torque_sd[:, 1] < 0.2)
     # The accelerometer and the plate both disagree with a two-joint human far beyond their covariances: said, not hidden.
     assert all(found.ratio > 4.0 for found in estimate.innovations)
 
@@ -71,14 +76,20 @@ def test_walking_equals_published_inverse_dynamics(dataset: Find) -> None:
     path = dataset("opensim_walk_gait2354/links_walk.npz")
     motion = load_links(path)
     noise = HumanDynamicsNoise(
-        propagation=1e-4, balance=1e-4, free_wrench=1e-4, link_acceleration=1e-4, contact_wrench=(1e4, 1e4, 1e4, 1e4, 1e4, 1e4)
+        propagation=1e-4,
+        balance=1e-4,
+        free_wrench=1e-4,
+        link_acceleration=1e-4,
+        contact_wrench=(1e4, 1e4, 1e4, 1e4, 1e4, 1e4),
     )
     # The published moments put what motion and plates disagree about on the pelvis: so does a free pelvis.
     estimate = solve_frames(HumanDynamics(motion, plates(path, motion), noise, contacts=("pelvis",)))
     assert estimate.solved
     published, names, t = _storage(dataset("opensim_walk_gait2354/ANSWERS_inverse_dynamics.sto"))
     with np.load(path) as data:
-        frames = {str(name): np.asarray(data["jR"][:, j], dtype=float) for j, name in enumerate(data["joints"])}
+        frames = {
+            str(name): np.asarray(data["jR"][:, j], dtype=float) for j, name in enumerate(data["joints"])
+        }
     axes = {"hip": np.array([0.0, 0.0, 1.0]), "ankle": np.array([-0.10501355, -0.17402245, 0.97912632])}
     coordinate = {"hip": "hip_flexion_{}_moment", "ankle": "ankle_angle_{}_moment"}
     inside = (motion.t > t[0] + 0.1) & (motion.t < t[-1] - 0.1)
@@ -94,7 +105,9 @@ def _squat(dataset: Find) -> tuple[LinkMotion, list[ExternalWrench]]:
     path = dataset("opencap_squat/links_squat.npz")
     whole = load_links(path)
     every = slice(0, len(whole), 6)
-    return whole.select(every), [sensor.frames(np.arange(len(whole))[every]) for sensor in plates(path, whole)]  # type: ignore[misc]
+    return whole.select(every), [
+        sensor.frames(np.arange(len(whole))[every]) for sensor in plates(path, whole)
+    ]  # type: ignore[misc]
 
 
 NOISE = HumanDynamicsNoise(balance=1e-2, link_acceleration=0.1, contact_wrench=(1e4, 1e4, 1e4, 1e3, 1e3, 1e3))
@@ -104,7 +117,8 @@ def test_squats_of_the_whole_body(dataset: Find) -> None:
     """Both plates and the arms; that plates and model mass disagree is noticed and said."""
     motion, sensors = _squat(dataset)
     estimate = solve_frames(HumanDynamics(motion, sensors, NOISE))
-    assert estimate.solved and len(sensors) == 2
+    assert estimate.solved
+    assert len(sensors) == 2
     knee = estimate.joint_moment[:, estimate.joint_names.index("walker_knee_r")]
     assert 20.0 < np.abs(knee).max() < 250.0
     # Make the model 4 kg too heavy: the plates say so.

@@ -28,14 +28,26 @@ def test_vectorised_kinematics_equal_pinocchio(floating: bool, kinds: str) -> No
     plain = PinocchioTree(model, compiled=False)
     one = [plain.kinematics(q[f], v[f], a[f]) for f in range(9)]
     slow = plain.kinematics(q, v, a)
-    for name in ("R", "p", "velocity", "acceleration", "transform", "bias", "joint_acceleration", "joint_centre"):
-        assert np.allclose(getattr(many, name), np.concatenate([getattr(k, name) for k in one]), atol=1e-12), name
+    for name in (
+        "R",
+        "p",
+        "velocity",
+        "acceleration",
+        "transform",
+        "bias",
+        "joint_acceleration",
+        "joint_centre",
+    ):
+        assert np.allclose(
+            getattr(many, name), np.concatenate([getattr(k, name) for k in one]), atol=1e-12
+        ), name
         assert np.allclose(getattr(many, name), getattr(slow, name), atol=1e-12), name
     for j, S in enumerate(many.subspaces):
         assert S is not None
         single = np.concatenate([np.asarray(k.subspaces[j]) for k in one])
         assert np.allclose(np.broadcast_to(S, single.shape), single, atol=1e-12)
-    assert len(tree.links) == 12 and len(tree.joint_names) == 11
+    assert len(tree.links) == 12
+    assert len(tree.joint_names) == 11
     data = model.createData()
     pin.forwardKinematics(model, data, q[3], v[3], a[3])
     frame = model.getFrameId("left_hand")
@@ -92,7 +104,8 @@ def test_motion_of_centres_of_mass_round_trip() -> None:
 def test_links_of_a_musculoskeletal_model(dataset) -> None:  # type: ignore[no-untyped-def]
     """The archive is read, its ground joint left out, its total mass right."""
     motion = load_links(dataset("opensim_walk_gait2354/links_walk.npz"))
-    assert motion.links[motion.root] == "pelvis" and len(motion.joints) == 11
+    assert motion.links[motion.root] == "pelvis"
+    assert len(motion.joints) == 11
     assert motion.total_mass == pytest.approx(72.5, abs=0.5)
 
 
@@ -108,7 +121,7 @@ def _motion() -> LinkMotion:
         ({"inertia": lambda m: -m.inertia}, "inertia of pelvis"),
         ({"inertia": lambda m: np.array([np.diag([1.0, 1.0, 5.0])] * m.mass.size)}, "inertia of pelvis"),
         ({"links": lambda m: ("pelvis",) * len(m.links)}, "links"),
-        ({"links": lambda m: ("",) + m.links[1:]}, r"links\[0\]"),
+        ({"links": lambda m: ("", *m.links[1:])}, r"links\[0\]"),
         ({"t": lambda m: m.t[::-1]}, "t of the link motion"),
         ({"p": lambda m: m.p[:, :3]}, "p of the link motion"),
         ({"R": lambda m: 2.0 * m.R}, "orientation of"),

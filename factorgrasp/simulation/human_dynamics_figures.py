@@ -1,0 +1,348 @@
+"""The figures and tables of the papers on human dynamics, from simulations with known truth, and the page that shows them.
+
+``python -m factorgrasp.simulation.human_dynamics_figures docs`` writes the figures into ``docs/figures`` and the tables into ``docs/human-dynamics.md``;
+``python -m factorgrasp.simulation.human_dynamics_figures docs robustness`` only the first of them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from factorgrasp import plots
+from factorgrasp.errors import InputError
+from factorgrasp.human_dynamics_task import HumanDynamicsResult, HumanDynamicsTask
+from factorgrasp.problems.external_wrenches import ExternalWrenches
+from factorgrasp.problems.human_dynamics_settings import HumanDynamicsNoise
+from factorgrasp.simulation.human_dynamics import (
+    FEET,
+    HANDS,
+    HumanRecording,
+    human_bowing,
+    human_carrying,
+    human_tpose,
+)
+from factorgrasp.typing import BoolArray, FloatArray
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+PAGE = "human-dynamics.md"
+ARM = ("jRightShoulder", "jRightElbow", "jRightWrist")
+HAND_COVARIANCE = (1e4, 1e4, 1e4, 1.0, 1.0, 1.0)
+"""Of unmeasured contacts: forces free, moments about where the hand holds small."""
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A table with its figure.
+
+    Attributes
+    ----------
+    header : tuple of str
+    rows : tuple of tuple of str
+    figure : Figure or None
+    """
+
+    header: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    figure: Figure | None = None
+
+    def markdown(self) -> str:
+        """The table."""
+        lines = ["| " + " | ".join(row) + " |" for row in (self.header, *self.rows)]
+        return "\n".join([lines[0], "|" + "---|" * len(self.header), *lines[1:]])
+
+
+def solve_recording(
+    recording: HumanRecording,
+    noise: HumanDynamicsNoise | None = None,
+    contacts: Sequence[str] = (),
+    payload: Sequence[str] = (),
+    sensors: Sequence[str] = ("plates",),
+) -> tuple[HumanDynamicsResult, BoolArray]:
+    """Estimate from noisy motion capture and what else was measured; the second is which frames (n,) there are.
+
+    Parameters
+    ----------
+    recording : HumanRecording
+    noise : HumanDynamicsNoise, optional
+        By default the noise of the motion, with :data:`HAND_COVARIANCE` for contacts.
+    contacts, payload : sequence of str
+        Unmeasured contacts (acting at the centres of mass), and those that hold an object.
+    sensors : sequence of {"plates", "imus", "hands"}
+    """
+    motion, keep, own = recording.measured_motion
+    chosen = replace(own, contact_wrench=HAND_COVARIANCE) if noise is None else noise
+    made: dict[str, Callable[[], list[object]]] = {
+        "plates": lambda: [*recording.foot_sensors(motion, keep)],
+        "imus": lambda: [*recording.imus(keep)],
+        "hands": lambda: [*recording.hand_sensors(keep)],
+    }
+    every = [sensor for name in sensors for sensor in made[name]()]
+    points = {link: recording.body.segments[link].com for link in contacts}
+    task = HumanDynamicsTask(
+        motion,
+        every,  # type: ignore[arg-type]
+        recording.t,
+        keep,
+        noise=chosen,
+        contacts=contacts,
+        points=points,
+        payload=payload,
+    )
+    return task.solve(), keep
+
+
+def robustness(seed: int = 0, torso_mass: float = 6.0) -> Shown:
+    """Latella 2018, table 1 and fig. 7: a mass on the torso that the model does not have, with a trusted and a distrusted model.
+
+    ``eps = |tau(with the mass) - tau(without)| - tau(of the mass)``, per joint, over a bowing block; the model never has the mass.
+    """
+    joints = {"ankle": "Ankle_y", "knee": "Knee_y", "hip": "Hip_y"}
+    with_mass, without = human_bowing(seed, torso_mass=torso_mass), human_bowing(seed)
+    names = [f"j{side}{tail}" for tail in joints.values() for side in ("Right", "Left")]
+    names += ["jL5S1_y"]
+    truth = np.abs(with_mass.truth.of(names) - without.truth.of(names))
+    errors: dict[str, FloatArray] = {}
+    series: dict[str, FloatArray] = {}
+    base, keep = _torques(without, HumanDynamicsNoise.latella2018(1e-4), names)
+    for label, model in (("model 1e-4", 1e-4), ("model 1e-1", 1e-1)):
+        found, _ = _torques(with_mass, HumanDynamicsNoise.latella2018(model), names)
+        series[label] = np.abs(found - base) - truth[keep]
+        errors[label] = np.sqrt(np.mean(series[label] ** 2, axis=0))
+    series["inverse dynamics"] = np.abs(_without_feet(with_mass, names) - _without_feet(without, names))[keep] - truth[keep]
+    errors["inverse dynamics"] = np.sqrt(np.mean(series["inverse dynamics"] ** 2, axis=0))
+    rows = []
+    for k, joint in enumerate([*joints, "L5/S1"]):
+        at = slice(2 * k, 2 * k + 2) if k < len(joints) else slice(2 * k, 2 * k + 1)
+        sizes = [f"{np.sqrt(np.mean(errors[label][at] ** 2)):.2f}" for label in ("inverse dynamics", "model 1e-4", "model 1e-1")]
+        rows.append((joint, f"{np.sqrt(np.mean(truth[:, at] ** 2)):.2f}", *sizes))
+    t = with_mass.t[keep]
+    made, axes = plots.figure(7.2, 2.4, columns=2, sharey=True)
+    for ax, k, title in ((axes[0], 0, "Right ankle"), (axes[1], 4, "Right hip")):
+        curves = [(label, series[label][:, k], colour) for label, colour in zip(series, ("x", "z", "accent"), strict=False)]
+        _curves(ax, title, "error (Nm)", t, curves)
+    header = ("joint", "torque of the mass (Nm)", "ID, no plates: error", "MAP, model 1e-4: error", "MAP, model 1e-1: error")
+    return Shown(header, tuple(rows), made)
+
+
+def _torques(recording: HumanRecording, noise: HumanDynamicsNoise, names: Sequence[str]) -> tuple[FloatArray, BoolArray]:
+    own = recording.measured_motion[2]
+    joined = replace(noise, joint_acceleration=own.joint_acceleration, link_acceleration=own.link_acceleration)
+    result, keep = solve_recording(recording, joined, sensors=("plates", "imus"))
+    return result.frames.torque[:, [result.frames.dof_names.index(name) for name in names]], keep
+
+
+def _without_feet(recording: HumanRecording, names: Sequence[str]) -> FloatArray:
+    """Deterministic inverse dynamics of the model that the estimator knows; the feet get what its own equations of motion ask for."""
+    from factorgrasp.simulation.human_dynamics import inverse_dynamics
+
+    torque = inverse_dynamics(recording.body, recording.truth.trajectory)
+    return torque[:, [recording.truth.dof_names.index(name) for name in names]]
+
+
+def sensor_sets(subjects: int = 10, seed: int = 0) -> Shown:
+    """Latella 2018, fig. 8: variances of torques with more and more sensors, while bowing and pushing on a robot's arms."""
+    rng = np.random.default_rng(seed)
+    sets = {
+        "CASE 1": ("plates",),
+        "CASE 2": ("plates", "imus"),
+        "CASE 3": ("plates", "imus", "hands"),
+    }
+    names = [f"j{side}{joint}_y" for joint in ("Ankle", "Hip") for side in ("Right", "Left")]
+    variances = np.zeros((subjects, len(sets), len(names)))
+    for s in range(subjects):
+        height, mass = 1.666 + 0.045 * rng.normal(), 61.14 + 5.76 * rng.normal()
+        recording = human_bowing(seed + s, push=30.0, repetitions=1, height=height, mass=mass)
+        for k, sensors in enumerate(sets.values()):
+            hands = () if "hands" in sensors else HANDS
+            result, _ = solve_recording(recording, contacts=hands, sensors=sensors)
+            at = [result.frames.dof_names.index(name) for name in names]
+            variances[s, k] = np.mean(result.frames.torque_sd[:, at] ** 2, axis=0)
+    mean = variances.mean(axis=0)
+    rows = tuple(
+        (label, *(f"{value:.3g}" for value in mean[k]), " + ".join(sensors)) for k, (label, sensors) in enumerate(sets.items())
+    )
+    made, (ax,) = plots.figure(7.2, 2.4)
+    for j, name in enumerate(names):
+        colour = plots.PALETTE["z" if "Ankle" in name else "accent"]
+        ax.bar(np.arange(len(sets)) + 0.2 * (j - 1.5), mean[:, j], 0.18, color=colour, alpha=1.0 if "Right" in name else 0.6, label=name)
+    ax.set_yscale("log")
+    ax.set_xticks(range(len(sets)), list(sets))
+    ax.set_ylabel("variance of the torque (Nm²)")
+    ax.legend(ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1.0))
+    return Shown(("", "right ankle (Nm²)", "left ankle", "right hip", "left hip", "accelerations of joints and"), rows, made)
+
+
+def tpose_efforts(seed: int = 0) -> Shown:
+    """Tirupachuri 2021, figs. 3, 10 and 16: efforts (norm of a joint's torques) of the right arm in the T-pose without and with 5 kg."""
+    rows = []
+    panels = []
+    for payload in (0.0, 5.0):
+        recording = human_tpose(seed, payload=payload)
+        held = ("RightHand",) if payload else ()
+        result, keep = solve_recording(recording, contacts=held, payload=held)
+        blind, _ = solve_recording(recording)
+        during = recording.during("T-pose")[keep]
+        ideal = _effort(_ideal_tpose(recording, payload), recording.truth.dof_names)
+        true = _effort(recording.truth.torque, recording.truth.dof_names)
+        found = _effort(result.frames.torque, result.frames.dof_names)
+        plain = _effort(blind.frames.torque, blind.frames.dof_names)
+        for k, joint in enumerate(ARM):
+            cells = [ideal[0, k], true[keep][during, k].mean(), found[during, k].mean(), plain[during, k].mean()]
+            rows.append((f"{payload:.0f} kg", joint.removeprefix("jRight").lower(), *(f"{value:.2f}" for value in cells)))
+        panels.append((payload, recording.t[keep], found, true[keep]))
+    made, axes = plots.figure(7.2, 2.4, columns=2)
+    for ax, (payload, t, found, true) in zip(axes, panels, strict=True):
+        curves = [(joint.removeprefix("jRight").lower(), found[:, k], "xyz"[k]) for k, joint in enumerate(ARM)]
+        _curves(ax, f"Effort of the right arm, {payload:.0f} kg in the hand", "Nm", t, curves)
+        for k in range(len(ARM)):
+            ax.plot(t, true[:, k], color=plots.PALETTE["ink"], linewidth=0.7, linestyle=(0, (3, 3)))
+    header = ("payload", "joint", "ideal T-pose (Nm)", "truth (Nm)", "estimate (Nm)", "hand taken to be free (Nm)")
+    return Shown(header, tuple(rows), made)
+
+
+def _effort(torque: FloatArray, names: Sequence[str]) -> FloatArray:
+    """Norm over the three axes of every joint of the arm, (n, 3)."""
+    parts = [[torque[:, names.index(f"{joint}_{axis}")] for axis in "xyz"] for joint in ARM]
+    return np.stack([np.linalg.norm(np.stack(part, axis=1), axis=1) for part in parts], axis=1)
+
+
+def _ideal_tpose(recording: HumanRecording, payload: float) -> FloatArray:
+    """Torques (1, 66) of gravity alone in the zero configuration."""
+    import pinocchio as pin
+
+    body = recording.body
+    if payload:
+        body = body.with_load("RightHand", payload, body.segments["RightHand"].com)
+    model = body.model()
+    zero = np.zeros(model.nv)
+    return np.asarray(pin.rnea(model, model.createData(), pin.neutral(model), zero, zero))[None, 6:]
+
+
+def hand_covariances(seed: int = 0) -> Shown:
+    """Tirupachuri 2021, figs. 11 to 14: the mass in the hand (5 kg) for covariances of the hand's force."""
+    recording = human_tpose(seed, payload=5.0)
+    motion, keep, own = recording.measured_motion
+    during = recording.during("T-pose")[keep]
+    feet = recording.foot_sensors(motion, keep)
+    rows, curves = [], []
+    for variance, colour in zip((1e-4, 1e-2, 1.0, 1e2, 1e4), ("x", "accent", "y", "z", "ink"), strict=True):
+        noise = replace(own, contact_wrench=(variance,) * 3 + (1e4,) * 3)
+        paper = ExternalWrenches(
+            motion, [replace(s, covariance=1e-6) for s in feet], ("RightHand",), replace(noise, free_wrench=1e-6), 1e-3
+        ).estimate()
+        force = np.linalg.norm(paper.of("RightHand")[:, :3], axis=1) / 9.80665
+        ours, _ = solve_recording(recording, noise, ("RightHand",), ("RightHand",))
+        assert ours.payload is not None
+        unshrunk = ours.payload.mass[during]
+        joint = np.linalg.norm(ours.frames.external_wrench[:, ours.frames.links.index("RightHand"), :3], axis=1) / 9.80665
+        rows.append((f"{variance:.0e}", f"{force[during].mean():.2f}", f"{joint[during].mean():.2f}", f"{np.nanmean(unshrunk):.2f}"))
+        curves.append((f"{variance:.0e}", force, colour))
+    made, (ax,) = plots.figure(7.2, 2.4)
+    _curves(ax, "Mass from the hand's force, by its covariance (N²)", "kg", recording.t[keep], curves)
+    header = ("covariance of the hand's force (N²)", "non-collocated, feet 1e-6, momentum 1e-3 (kg)", "joint estimate (kg)", "payload, prior taken out (kg)")
+    return Shown(header, tuple(rows), made)
+
+
+def carrying(seed: int = 0) -> Shown:
+    """Tirupachuri 2021, figs. 17 and 18: 9.55 kg in both hands while standing, on one foot and walking."""
+    rows = []
+    made, axes = plots.figure(7.2, 4.0, rows=2)
+    for motion in ("standing", "one_foot", "walking"):
+        recording = human_carrying(seed, motion=motion)  # type: ignore[arg-type]
+        result, keep = solve_recording(recording, contacts=HANDS, payload=HANDS)
+        assert result.payload is not None
+        mass, sd = result.payload.mass, result.payload.mass_sd
+        feet = sum(recording.plates[link].force for link in FEET)[keep]
+        paper = np.linalg.norm(feet, axis=1) / 9.80665 - recording.body.mass
+        for phase in recording.phases:
+            during = recording.during(phase)[keep]
+            rows.append(
+                (
+                    f"{motion.replace('_', ' ')}: {phase}",
+                    f"{paper[during].mean():.2f} ± {paper[during].std():.2f}",
+                    f"{mass[during].mean():.2f} ± {mass[during].std():.2f}",
+                    f"{np.median(sd[during]):.2f}",
+                )
+            )
+        if motion != "standing":
+            ax = axes[0] if motion == "one_foot" else axes[1]
+            t = recording.t[keep]
+            _curves(ax, f"Mass in both hands, {motion.replace('_', ' ')}", "kg", t, [("feet minus body", paper, "x"), ("estimate", mass, "z")])
+            ax.axhline(9.55, color=plots.PALETTE["ink"], linewidth=0.8)
+    header = ("phase", "force of the feet less the body (kg)", "estimate (kg)", "stated sd of a frame (kg)")
+    return Shown(header, tuple(rows), made)
+
+
+FIGURES: dict[str, Callable[[], Shown]] = {
+    "robustness": robustness,
+    "sensor_sets": sensor_sets,
+    "tpose_efforts": tpose_efforts,
+    "hand_covariances": hand_covariances,
+    "carrying": carrying,
+}
+
+
+def write_page(folder: Path, names: Sequence[str] = tuple(FIGURES)) -> list[Path]:
+    """Draw figures into ``folder/figures`` and renew the tables between ``<!-- name -->`` and ``<!-- end -->`` in the page.
+
+    Raises
+    ------
+    InputError
+        For a name that is none, or a page without its place.
+    """
+    from factorgrasp.atomic import replacing, write_text
+
+    page = folder / PAGE
+    text = page.read_text(encoding="utf-8")
+    written = []
+    for name in names:
+        if name not in FIGURES:
+            raise InputError("figure", "one of " + ", ".join(FIGURES), repr(name))
+        shown = FIGURES[name]()
+        place = re.compile(rf"(<!-- {name} -->\n).*?(<!-- end -->)", re.DOTALL)
+        if not place.search(text):
+            raise InputError(str(page), f"a place for {name}: <!-- {name} --> ... <!-- end -->", "none")
+        content = shown.markdown()
+        text = place.sub(lambda match, content=content: f"{match[1]}{content}\n{match[2]}", text)
+        if shown.figure is not None:
+            path = folder / "figures" / f"human_dynamics_{name}.svg"
+            with replacing(path) as temporary:
+                shown.figure.savefig(temporary, format="svg", facecolor=plots.PALETTE["paper"], metadata={"Date": None})
+            written.append(path)
+    return [*written, write_text(page, text)]
+
+
+@plots.styled
+def _curves(ax: object, title: str, unit: str, t: FloatArray, curves: Sequence[tuple[str, FloatArray, str]]) -> None:
+    from matplotlib.axes import Axes
+
+    assert isinstance(ax, Axes)
+    for label, values, colour in curves:
+        ax.plot(t, values, color=plots.PALETTE[colour], label=label, linewidth=1.0)
+    ax.set_title(title)
+    ax.set_ylabel(unit)
+    ax.set_xlabel("time (s)")
+    ax.legend(ncols=1, loc="upper right", fontsize=7.5)
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description="Draw the figures of the human-dynamics page and renew its tables.")
+    parser.add_argument("folder", type=Path, help=f"folder with {PAGE}")
+    parser.add_argument("names", nargs="*", default=list(FIGURES), help="of: " + ", ".join(FIGURES))
+    arguments = parser.parse_args()
+    for path in write_page(arguments.folder, arguments.names):
+        print(f"wrote {path}")
+
+
+if __name__ == "__main__":
+    main()
