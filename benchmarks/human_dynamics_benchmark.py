@@ -9,8 +9,8 @@ What is compared:
 - as we model it: 22 ball joints between 23 links (massless links merged), the same sensors and variances of the links with mass.
 
 Times of iDynTree are those inside its two calls (update and solve); the conversion of its arguments is left out. Ours start from
-(q, qd, qdd) and the measurements as numpy arrays and end with torques; "one frame" is the streaming estimator, "many" the recording at once,
-its set-up included. Limits: one machine, random motion, the accuracy of timers; first calls (compilation) are left out on both sides.
+(q, qd, qdd) and the measurements as numpy arrays and end with torques; "one frame" is the streaming estimator, "many" the recording at
+once, its set-up included. Limits: one machine, random motion, the accuracy of timers; first calls (compilation) are left out on both sides.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ import platform
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -37,17 +38,30 @@ from factorgrasp.problems.link_motion_pinocchio import PinocchioTree
 from factorgrasp.solvers.frames import FrameSolver, solve_frames
 
 SEGMENTS: tuple[tuple[str, str, tuple[float, float, float], float], ...] = (
-    ("pelvis", "", (0.0, 0.0, 0.0), 8.0), ("l5", "pelvis", (0.0, 0.0, 0.1), 7.0), ("l3", "l5", (0.0, 0.0, 0.1), 7.0),
-    ("t12", "l3", (0.0, 0.0, 0.1), 7.0), ("t8", "t12", (0.0, 0.0, 0.1), 8.0), ("neck", "t8", (0.0, 0.0, 0.15), 1.5),
-    ("head", "neck", (0.0, 0.0, 0.1), 4.0), ("right_shoulder", "t8", (0.0, -0.05, 0.1), 1.5), ("right_upper_arm", "right_shoulder", (0.0, -0.13, 0.0), 2.0),
-    ("right_forearm", "right_upper_arm", (0.0, -0.3, 0.0), 1.2), ("right_hand", "right_forearm", (0.0, -0.25, 0.0), 0.5),
-    ("left_shoulder", "t8", (0.0, 0.05, 0.1), 1.5), ("left_upper_arm", "left_shoulder", (0.0, 0.13, 0.0), 2.0),
-    ("left_forearm", "left_upper_arm", (0.0, 0.3, 0.0), 1.2), ("left_hand", "left_forearm", (0.0, 0.25, 0.0), 0.5),
-    ("right_thigh", "pelvis", (0.0, -0.09, 0.0), 8.0), ("right_shank", "right_thigh", (0.0, 0.0, -0.42), 3.5),
-    ("right_foot", "right_shank", (0.0, 0.0, -0.4), 0.9), ("right_toe", "right_foot", (0.15, 0.0, -0.05), 0.2),
-    ("left_thigh", "pelvis", (0.0, 0.09, 0.0), 8.0), ("left_shank", "left_thigh", (0.0, 0.0, -0.42), 3.5),
-    ("left_foot", "left_shank", (0.0, 0.0, -0.4), 0.9), ("left_toe", "left_foot", (0.15, 0.0, -0.05), 0.2),
-)  # fmt: skip
+    ("pelvis", "", (0.0, 0.0, 0.0), 8.0),
+    ("l5", "pelvis", (0.0, 0.0, 0.1), 7.0),
+    ("l3", "l5", (0.0, 0.0, 0.1), 7.0),
+    ("t12", "l3", (0.0, 0.0, 0.1), 7.0),
+    ("t8", "t12", (0.0, 0.0, 0.1), 8.0),
+    ("neck", "t8", (0.0, 0.0, 0.15), 1.5),
+    ("head", "neck", (0.0, 0.0, 0.1), 4.0),
+    ("right_shoulder", "t8", (0.0, -0.05, 0.1), 1.5),
+    ("right_upper_arm", "right_shoulder", (0.0, -0.13, 0.0), 2.0),
+    ("right_forearm", "right_upper_arm", (0.0, -0.3, 0.0), 1.2),
+    ("right_hand", "right_forearm", (0.0, -0.25, 0.0), 0.5),
+    ("left_shoulder", "t8", (0.0, 0.05, 0.1), 1.5),
+    ("left_upper_arm", "left_shoulder", (0.0, 0.13, 0.0), 2.0),
+    ("left_forearm", "left_upper_arm", (0.0, 0.3, 0.0), 1.2),
+    ("left_hand", "left_forearm", (0.0, 0.25, 0.0), 0.5),
+    ("right_thigh", "pelvis", (0.0, -0.09, 0.0), 8.0),
+    ("right_shank", "right_thigh", (0.0, 0.0, -0.42), 3.5),
+    ("right_foot", "right_shank", (0.0, 0.0, -0.4), 0.9),
+    ("right_toe", "right_foot", (0.15, 0.0, -0.05), 0.2),
+    ("left_thigh", "pelvis", (0.0, 0.09, 0.0), 8.0),
+    ("left_shank", "left_thigh", (0.0, 0.0, -0.42), 3.5),
+    ("left_foot", "left_shank", (0.0, 0.0, -0.4), 0.9),
+    ("left_toe", "left_foot", (0.15, 0.0, -0.05), 0.2),
+)
 """Name, parent, place of the joint in the parent (m) and mass (kg): the layout of a motion-capture suit, round numbers."""
 
 IMUS = (
@@ -76,7 +90,8 @@ def human_urdf() -> str:
                 parts.append(f'<link name="{below}"/>')
             at = " ".join(str(v) for v in place) if axis == "x" else "0 0 0"
             parts.append(
-                f'<joint name="j_{name}_{axis}" type="revolute"><parent link="{above}"/><child link="{below}"/><origin xyz="{at}" rpy="0 0 0"/>'
+                f'<joint name="j_{name}_{axis}" type="revolute"><parent link="{above}"/><child link="{below}"/>'
+                f'<origin xyz="{at}" rpy="0 0 0"/>'
                 f'<axis xyz="{unit}"/><limit effort="999" velocity="99" lower="-9" upper="9"/></joint>'
             )
             above = below
@@ -224,7 +239,7 @@ def _ours(
             covariance=covariance,
         )
         online.step(t[0], q[0], v[0], a[0], values[0])
-        step, worst = median(lambda f: online.step(t[f], q[f], v[f], a[f], values[f]), n)
+        step, worst = median(lambda f, step=online.step: step(t[f], q[f], v[f], a[f], values[f]), n)
         results[f"{name}: one frame{' with covariance' if covariance else ''}"] = step
         results[f"{name}: one frame{' with covariance' if covariance else ''}, 99 %"] = worst
 
@@ -248,9 +263,8 @@ def _ours(
         parts = {}
         for covariance in (False, True):
             solver.solve(entries[rows], rhs[rows], covariance)
-            parts[covariance] = median(
-                lambda _: solver.solve(entries[rows], rhs[rows], covariance), 30 if label == "one" else 3
-            )[0]
+            solve = partial(solver.solve, entries[rows], rhs[rows], covariance)
+            parts[covariance] = median(lambda _, run=solve: run(), 30 if label == "one" else 3)[0]
         size = rhs[rows].shape[0]
         results[f"{name}: linear algebra, {label}"] = parts[False] / size
         results[f"{name}: all marginal variances on top, {label}"] = (parts[True] - parts[False]) / size
@@ -258,7 +272,6 @@ def _ours(
             results[f"{name}: one more solve"] = results[f"{name}: linear algebra, one"]
     contacts = [s for s in whole.sensors if isinstance(s, ExternalWrench)]
     external = ExternalWrenches(whole.motion, contacts, HANDS, whole.noise)
-    whole.motion.momentum_rate
     results[f"{name}: momentum task, many frames"] = median(lambda _: external.estimate(), 3)[0] / n
 
     def both() -> None:
@@ -283,16 +296,18 @@ def _ours(
     both()
     results[f"{name}: both tasks chained with covariance, many frames"] = median(lambda _: both(), 2)[0] / n
     if name == "ball joints":
-        free = solve_frames(whole.at(slice(0, 10)), covariance=False)
+        few = slice(0, 100)
+        free = solve_frames(whole.at(few), covariance=False)
         j = free.joint_names.index("j_right_shank")
         at = free.dof_names.index("j_right_shank_y")
         limit = 0.5 * float(np.abs(free.torque[:, at]).max())
-        bound = HumanDynamics(whole.motion.select(slice(0, 10)), [s.frames(slice(0, 10)) for s in whole.sensors], whole.noise,
+        bound = HumanDynamics(whole.motion.select(few), [s.frames(few) for s in whole.sensors], whole.noise,
         use_motion=False,
                               constraints=[TorqueLimit(free.joint_names[j], -limit, limit)])  # fmt: skip
-        found = solve_frames(bound, covariance=False)
-        results["ball joints: piqp with torque limits, one frame"] = found.time / 10
-        results["ball joints: active limits in 10 frames"] = float(len(found.active))
+        for solver in ("active-set", "piqp"):
+            found = solve_frames(bound, solver, covariance=False)
+            results[f"ball joints: {solver} with torque limits, one frame"] = found.time / len(found)
+            results[f"ball joints: active limits by {solver}"] = float(len(found.active))
 
 
 def _report(results: dict[str, float], peer: dict[str, float], frames: int) -> None:

@@ -106,8 +106,10 @@ class IDynTreePeer:
         for sensor in self.helper.getSensorsOrdering():
             where = slice(sensor.range.offset, sensor.range.offset + sensor.range.size)
             kind = {
-                self.idt.NET_EXT_WRENCH_SENSOR: "wrench", self.idt.DOF_ACCELERATION_SENSOR: "joint", self.idt.ACCELEROMETER_SENSOR: "accelerometer",
-            }.get(sensor.type, "momentum")  # fmt: skip
+                self.idt.NET_EXT_WRENCH_SENSOR: "wrench",
+                self.idt.DOF_ACCELERATION_SENSOR: "joint",
+                self.idt.ACCELEROMETER_SENSOR: "accelerometer",
+            }.get(sensor.type, "momentum")
             self.ranges[kind, sensor.id] = where
             if kind == "wrench":
                 variance[where] = (c.wrenches or {}).get(sensor.id, c.wrench_default)
@@ -173,11 +175,15 @@ class IDynTreePeer:
         return D.toNumPy().copy(), bD.toNumPy().copy(), Y.toNumPy().copy(), bY.toNumPy().copy()
 
     def unknowns(self) -> dict[tuple[str, str], slice]:
-        """Where the unknowns stand, by kind ("acceleration", "external", "wrench", "joint") and name of link, joint or degree of freedom."""
+        """Where the unknowns stand, by kind ("acceleration", "external", "wrench", "joint") and name of link or joint."""
         idt = self.idt
         kinds = {
-            idt.LINK_BODY_PROPER_ACCELERATION: "acceleration", idt.LINK_BODY_PROPER_CLASSICAL_ACCELERATION: "acceleration", idt.NET_EXT_WRENCH: "external", idt.JOINT_WRENCH: "wrench", idt.DOF_ACCELERATION: "joint",
-        }  # fmt: skip
+            idt.LINK_BODY_PROPER_ACCELERATION: "acceleration",
+            idt.LINK_BODY_PROPER_CLASSICAL_ACCELERATION: "acceleration",
+            idt.NET_EXT_WRENCH: "external",
+            idt.JOINT_WRENCH: "wrench",
+            idt.DOF_ACCELERATION: "joint",
+        }
         return {
             (kinds[v.type], v.id): slice(v.range.offset, v.range.offset + v.range.size)
             for v in self.helper.getDynamicVariablesOrdering()

@@ -171,12 +171,18 @@ def payload_of(
     covariance = read @ P @ np.swapaxes(read, 1, 2)
     arm = rotate(R, np.array([(points or {}).get(link, np.zeros(3)) for link in links]))
     w = motion.angular_velocity[:, at]
-    felt = motion.acceleration[:, at] + np.cross(motion.angular_acceleration[:, at], arm) + np.cross(w, np.cross(w, arm))
+    felt = (
+        motion.acceleration[:, at]
+        + np.cross(motion.angular_acceleration[:, at], arm)
+        + np.cross(w, np.cross(w, arm))
+    )
     u = motion.gravity - felt.mean(axis=1)
     good: BoolArray = np.asarray(np.isfinite(covariance).all(axis=(1, 2)))
     posterior = np.linalg.inv(np.where(good[:, None, None], covariance, np.eye(3)))
     data = posterior - np.linalg.inv(prior)
-    known: BoolArray = good & np.asarray(np.linalg.eigvalsh(data)[:, 0] > 1e-9 * np.linalg.eigvalsh(posterior)[:, 2])
+    known: BoolArray = good & np.asarray(
+        np.linalg.eigvalsh(data)[:, 0] > 1e-9 * np.linalg.eigvalsh(posterior)[:, 2]
+    )
     spread = np.linalg.inv(np.where(known[:, None, None], data, np.eye(3)))
     h = u / np.sum(u**2, axis=1, keepdims=True)
     mass = np.einsum("ni,nij,njk,nk->n", h, spread, posterior, np.where(known[:, None], force, np.nan))

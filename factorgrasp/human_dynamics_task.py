@@ -160,7 +160,9 @@ class HumanDynamicsTask:
         if self.contacts and self.method == "joint":
             frames, x, P = solve_with_contacts(self.problem, solver)
             if self.payload:
-                payload = payload_of(self.problem.motion, self.noise, self.contacts, self.payload, x, P, self._points)
+                payload = payload_of(
+                    self.problem.motion, self.noise, self.contacts, self.payload, x, P, self._points
+                )
         else:
             frames = solve_frames(self.problem, solver)
             if self.payload:

@@ -16,7 +16,9 @@ if TYPE_CHECKING:
     from factorgrasp.problems.grasp_from_poses_estimate import GraspFromPosesEstimate
     from factorgrasp.problems.grasp_from_poses_settings import GraspFromPosesNoise, GraspFromPosesSettings
     from factorgrasp.problems.grasp_pose import GraspPose
+    from factorgrasp.problems.grasp_segments import GraspSegments
     from factorgrasp.problems.grasp_settings import GraspNoise, GraspPrior, GraspSettings
+    from factorgrasp.problems.grasp_track import GraspTrack
     from factorgrasp.problems.human_dynamics import HumanDynamics
     from factorgrasp.problems.human_dynamics_constraints import (
         CentreOfPressure,
@@ -50,7 +52,9 @@ _WHERE = {
     "GraspPoseEstimate": "grasp_estimate",
     "GraspPoseFromPoses": "grasp_from_poses",
     "GraspPrior": "grasp_settings",
+    "GraspSegments": "grasp_segments",
     "GraspSettings": "grasp_settings",
+    "GraspTrack": "grasp_track",
     "GyroscopeDerivative": "human_dynamics_sensors",
     "HumanDynamics": "human_dynamics",
     "HumanDynamicsEstimate": "human_dynamics_estimate",
@@ -77,7 +81,9 @@ __all__ = [
     "GraspPoseEstimate",
     "GraspPoseFromPoses",
     "GraspPrior",
+    "GraspSegments",
     "GraspSettings",
+    "GraspTrack",
     "GyroscopeDerivative",
     "HumanDynamics",
     "HumanDynamicsEstimate",

@@ -119,18 +119,19 @@ class ExternalWrenchesEstimate:
         return 0.5 * (out + np.swapaxes(out, 1, 2))
 
     def as_sensor(self, links: Sequence[str] | None = None) -> WrenchSet:
-        """These wrenches with their full covariance as a measurement for :class:`factorgrasp.problems.human_dynamics.HumanDynamics`.
+        """These wrenches with their full covariance, as a measurement for ``HumanDynamics``.
 
-        By default of all measured links and contacts. The accelerations of the links are used by both steps, so that the second one
-        is more confident than the joint estimate (the same sensors and contacts in one `HumanDynamics`), which uses them once.
+        By default of all measured links and contacts. The accelerations of the links are used by both steps, so that the second one is more
+        confident than the joint estimate (the same sensors and contacts in one ``HumanDynamics``), which uses them once.
         """
         chosen = tuple(links) if links is not None else (*self.measured, *self.contacts)
         values = np.concatenate([self.of(link) for link in chosen], axis=1)
         return WrenchSet(values, self.joint_covariance(chosen), "external wrenches by momentum", links=chosen)
 
     def payload(self, links: Sequence[str] | None = None) -> Payload:
-        """Mass that hangs on some links (all contacts): ``m = sum_h f_h' u_h / |u_h|^2`` with ``u_h = g - a_h``, the links'
-        own motion included.
+        """Mass that hangs on some links (all contacts): ``m = sum_h f_h' u_h / |u_h|^2`` with ``u_h = g - a_h``.
+
+        The links' own acceleration is part of it: dividing by standard gravity alone is biased while they move.
 
         Raises
         ------

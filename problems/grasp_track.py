@@ -11,9 +11,8 @@ import numpy as np
 
 from factorgrasp import lie
 from factorgrasp.estimate import Estimate, TermSummary
-from factorgrasp.observability import Observability
 from factorgrasp.problems.grasp_estimate import GraspPoseEstimate
-from factorgrasp.status import Status
+from factorgrasp.problems.grasp_view import EstimateView
 from factorgrasp.typing import FloatArray, JsonDict, State
 
 if TYPE_CHECKING:
@@ -21,7 +20,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class GraspTrack:
+class GraspTrack(EstimateView):
     """Where the human grasped, segment by segment.
 
     Attributes
@@ -98,24 +97,9 @@ class GraspTrack:
         )
 
     @property
-    def status(self) -> Status:
-        """How the solve ended."""
-        return self.estimate.status
-
-    @property
-    def message(self) -> str:
-        """Why it ended so and what would help."""
-        return self.estimate.message
-
-    @property
     def log_evidence(self) -> float:
         """How well the width of the walk explains the data; see :meth:`GraspSegments.log_evidence`."""
         return self.problem.log_evidence(self.state)
-
-    @property
-    def observability(self) -> Observability | None:
-        """Directions that the motion showed or did not show."""
-        return self.estimate.observability
 
     def change(self, first: int = 0, last: int = -1) -> tuple[FloatArray, FloatArray]:
         """How the grasp moved from one segment to another.

@@ -115,6 +115,18 @@ class HumanDynamics:
         self._whitening.apply(entries, rhs, values, frames)
         return entries, rhs
 
+    def inequality_frames(self, frames: slice) -> tuple[FloatArray, FloatArray]:
+        """Non-zeros (n, nnz) of the inequalities' rows and their limits (n, rows) of some frames."""
+        k, rows = self.motion.kinematics(frames), self.pattern.inequalities
+        entries, limits = np.empty((k.count, rows.matrix.nnz)), np.empty((k.count, rows.height))
+        for constraint in self.constraints:
+            blocks, limit = constraint.all_rows(self.system.tree, k)
+            limits[:, rows.slices[constraint.name]] = limit
+            patterns = rows.patterns_of(constraint.name)
+            for variable, block in blocks.items():
+                entries[:, rows.places(constraint.name, variable)] = block[:, patterns[variable]]
+        return entries, limits
+
     def frame(self, index: int) -> LeastSquares:
         """One frame with its values, covariances and constraints filled in; later calls refill the same object."""
         if not 0 <= index < len(self):
@@ -132,7 +144,7 @@ class HumanDynamics:
             hard, right = system.hard(k)
             problem.equalities.matrix.data[:], problem.equalities.rhs[:] = hard[0], right[0]
         for constraint in self.constraints:
-            blocks, limit = constraint.rows(self.motion.tree, k, index)
+            blocks, limit = constraint.rows(self.system.tree, k)
             problem.set_constraint(constraint.name, blocks, limit)
         return problem
 

@@ -59,7 +59,7 @@ def active_constraints(
             z = _multiplier(result, f, constraint.name, where[constraint.name])
             if z is None:
                 continue
-            blocks, limit = constraint.rows(problem.system.tree, one, f)
+            blocks, limit = constraint.rows(problem.system.tree, one)
             value = sum(block @ result.x[f][problem.pattern.columns[v]] for v, block in blocks.items())
             slack = limit - value
             for row in np.flatnonzero((z > slack) & (z > 1e-6)):

@@ -38,9 +38,14 @@ class DynamicsConstraint(ABC):
     def row_pattern(self, tree: BodyTree) -> Constraint:
         """Name, number and pattern of the rows."""
 
+    def rows(self, tree: BodyTree, k: LinkKinematics) -> tuple[dict[str, FloatArray], FloatArray]:
+        """Blocks (rows, 6) per variable and limits (rows,) for the one frame in `k`."""
+        blocks, limit = self.all_rows(tree, k)
+        return {name: block[0] for name, block in blocks.items()}, limit
+
     @abstractmethod
-    def rows(self, tree: BodyTree, k: LinkKinematics, frame: int) -> tuple[dict[str, FloatArray], FloatArray]:
-        """Blocks (rows, 6) per variable and limits (rows,) for the one frame in `k`, which is number `frame` of the problem."""
+    def all_rows(self, tree: BodyTree, k: LinkKinematics) -> tuple[dict[str, FloatArray], FloatArray]:
+        """Blocks (1 or n, rows, 6) per variable and limits (rows,) for all frames in `k`."""
 
     @abstractmethod
     def words(self, row: int) -> str:
@@ -93,9 +98,9 @@ class ContactConstraint(DynamicsConstraint):
             self.unit,
         )
 
-    def rows(self, tree: BodyTree, k: LinkKinematics, frame: int) -> tuple[dict[str, FloatArray], FloatArray]:
+    def all_rows(self, tree: BodyTree, k: LinkKinematics) -> tuple[dict[str, FloatArray], FloatArray]:
         """Blocks and limits; the same in every frame, as the contact moves with the link."""
-        return {wrench_on(self.link): self._in_link()}, self.limit()
+        return {wrench_on(self.link): self._in_link()[None]}, self.limit()
 
     def _in_link(self) -> FloatArray:
         back = np.asarray(self.R_l_s, dtype=float).T
@@ -272,16 +277,15 @@ class TorqueLimit(DynamicsConstraint):
             "Nm",
         )
 
-    def rows(self, tree: BodyTree, k: LinkKinematics, frame: int) -> tuple[dict[str, FloatArray], FloatArray]:
-        """Blocks and limits of one frame."""
+    def all_rows(self, tree: BodyTree, k: LinkKinematics) -> tuple[dict[str, FloatArray], FloatArray]:
+        """Blocks and limits of all frames."""
         S = k.subspaces[tree.joints.index(self.joint)]
         assert S is not None
-        back = S[0].T
-        low, high = self._limits(back.shape[0])
+        back = np.swapaxes(S, 1, 2)
+        low, high = self._limits(back.shape[1])
         # A limit that is not there is one that no human joint reaches: an infinite one is no number for a solver.
-        return {wrench_of(self.joint): np.vstack([back, -back])}, np.minimum(
-            np.concatenate([high, -low]), 1e6
-        )
+        limit = np.minimum(np.concatenate([high, -low]), 1e6)
+        return {wrench_of(self.joint): np.concatenate([back, -back], axis=1)}, limit
 
     def words(self, row: int) -> str:
         """What it means that a row holds with equality."""

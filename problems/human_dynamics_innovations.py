@@ -1,8 +1,8 @@
 """Does a sensor agree with what all the others say of it? Innovations, their normalised squares (NIS), and covariances proposed from them.
 
-With the residual ``r = y - Y d`` of the estimate from all sensors and its covariance ``M = R - Y P Y'``, the innovation of leaving the sensor
-out is ``R M^-1 r`` with covariance ``R M^-1 R``, so that ``NIS = r' M^-1 r``. Directions that nothing but the sensor itself informs (M near
-zero against R) cannot be judged; they are left out of the NIS and of its degrees of freedom.
+With the residual ``r = y - Y d`` of the estimate from all sensors and its covariance ``M = R - Y P Y'``, the innovation of leaving the
+sensor out is ``R M^-1 r`` with covariance ``R M^-1 R``, so that ``NIS = r' M^-1 r``. Directions that nothing but the sensor itself informs
+(M near zero against R) cannot be judged; they are left out of the NIS and of its degrees of freedom.
 """
 
 from __future__ import annotations

@@ -136,7 +136,8 @@ def _external_wrench(tree: BodyTree, sensor: Sensor) -> Made:
     assert isinstance(sensor, kinds.ExternalWrench)
     name, at = wrench_on(sensor.link), tree.links.index(sensor.link)
     if sensor.frame == "world":
-        pattern: FloatArray = np.kron(np.eye(2), np.ones((3, 3)))
+        pattern: FloatArray = np.zeros((6, 6))
+        pattern[:3, :3] = pattern[3:, 3:] = 1.0
 
         def make(k: LinkKinematics) -> FloatArray:
             out = np.zeros((k.count, 6, 6))

@@ -347,10 +347,14 @@ class HumanDynamicsSystem:
             names, resolve(noise.prior_joint_acceleration, names, sizes, "prior variance"), strict=True
         ):
             by_name[joint_acceleration_of(name)] = variance
-        return [
-            Term(f"prior of {v.name}", v.size, (v.name,), Covariance.diagonal(by_name[v.name]), pattern={v.name: np.eye(v.size, dtype=bool)}, unit=v.unit)
-            for v in variables
-        ]  # fmt: skip
+        out = []
+        for v in variables:
+            covariance = Covariance.diagonal(by_name[v.name])
+            pattern = {v.name: np.eye(v.size, dtype=bool)}
+            out.append(
+                Term(f"prior of {v.name}", v.size, (v.name,), covariance, pattern=pattern, unit=v.unit)
+            )
+        return out
 
     @staticmethod
     def _first_covariance(rows: SensorRows) -> Covariance:

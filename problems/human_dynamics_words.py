@@ -52,6 +52,7 @@ def agreement_words(found: Innovation) -> str:
     verdict = "its covariance fits"
     if ratio > WIDE:
         times = f"{np.sqrt(ratio):.1f} times as large as its covariance and theirs say"
-        verdict = f"disagrees with the model and the other sensors: errors {times}"elif ratio < 1.0 / WIDE:
+        verdict = f"disagrees with the model and the other sensors: errors {times}"
+    elif ratio < 1.0 / WIDE:
         verdict = f"agrees better than its covariance says: errors {np.sqrt(ratio):.2f} times as large"
     return f"{found.name}: NIS per degree of freedom {ratio:.3g}; {verdict}"

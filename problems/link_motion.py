@@ -259,7 +259,7 @@ class LinkMotion:
     @property
     def root(self) -> int:
         """Index of the root link."""
-        return int(getattr(self, "_root"))
+        return int(self.__dict__["_root"])
 
     @property
     def parents(self) -> IntArray:

@@ -32,13 +32,13 @@ def check_masses(links: Sequence[str], mass: FloatArray, com: FloatArray, inerti
             raise InputError(f"mass of {link}", "a finite mass of at least 0 kg", f"{mass[i]:.6g} kg")
         if not np.all(np.isfinite(com[i])):
             raise InputError(f"centre of mass of {link}", "finite coordinates in m", f"{com[i]}")
-        I = inertia[i]
-        if not np.all(np.isfinite(I)):
+        moment = inertia[i]
+        if not np.all(np.isfinite(moment)):
             raise InputError(f"inertia of {link}", "finite numbers in kg m^2", "NaN or infinity")
-        scale = float(np.abs(I).max())
-        if not np.allclose(I, I.T, rtol=0.0, atol=1e-9 * scale):
-            raise InputError(f"inertia of {link}", "a symmetric matrix", f"{I.tolist()}")
-        moments = np.linalg.eigvalsh(I)
+        scale = float(np.abs(moment).max())
+        if not np.allclose(moment, moment.T, rtol=0.0, atol=1e-9 * scale):
+            raise InputError(f"inertia of {link}", "a symmetric matrix", f"{moment.tolist()}")
+        moments = np.linalg.eigvalsh(moment)
         if moments[0] < -1e-9 * scale:
             raise InputError(
                 f"inertia of {link}",

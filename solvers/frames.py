@@ -123,8 +123,8 @@ class FrameSolver:
     def __init__(
         self, pattern: LeastSquares, marginals: Sequence[IntArray] = (), compiled: bool | None = None
     ) -> None:
-        if pattern.constrained:
-            raise SolverError("FrameSolver takes no constraints: use solve_frames with a QP solver")
+        if pattern.equalities.height:
+            raise SolverError("FrameSolver takes no equality constraints: use solve_frames with a QP solver")
         matrix = pattern.jacobian.matrix
         self._pattern, self.size, self.rows = pattern, pattern.size, matrix.shape[0]
         self.marginals = tuple(np.asarray(group, dtype=np.int64) for group in marginals)
@@ -304,8 +304,8 @@ def solve_frames(
     problem : FrameProblem
         Such as :class:`factorgrasp.problems.human_dynamics.HumanDynamics`.
     solver : str, optional
-        By default "cholesky" by one plan for all frames; frame by frame, "kkt" with equality constraints and the best QP solver installed
-        with inequalities. Any other solver's name also works, frame by frame.
+        By default "cholesky" by one plan for all frames; with inequalities "active-set", which hands frames that it cannot settle to the best
+        QP solver installed; with equality constraints "kkt" or that QP solver, frame by frame. Any other solver's name also works so.
     options : SolverOptions, optional
         For a solver that goes frame by frame.
     covariance : bool
@@ -319,11 +319,48 @@ def solve_frames(
     if problem.frame_count == 0:
         raise InputError("frames", "at least one frame", "none")
     first = problem.frame(0)
+    only_rows = (
+        first.inequalities.height
+        and not first.equalities.height
+        and not np.isfinite([first.lower, first.upper]).any()
+    )
     if solver in (None, "cholesky") and not first.constrained:
         result = _all_at_once(problem, covariance)
+    elif solver in (None, "active-set") and only_rows and hasattr(problem, "inequality_frames"):
+        result = _by_active_set(problem, options, covariance)
     else:
         result = _one_by_one(problem, first, solver, options, covariance)
     return problem.view_frames(result)
+
+
+def _by_active_set(problem: Any, options: SolverOptions | None, covariance: bool) -> FrameResult:
+    from factorgrasp.solvers.frame_active_set import ActiveSetSolver
+
+    started = time.perf_counter()
+    machine = ActiveSetSolver(problem)
+    count = problem.frame_count
+    step = max(LANES, MOST_ENTRIES // max(problem.pattern.jacobian.matrix.nnz, 1))
+    parts, left = [], []
+    for first in range(0, count, step):
+        found = machine.solve(slice(first, min(first + step, count)), covariance)
+        parts.append(found.result)
+        left += [first + int(f) for f in np.flatnonzero(~found.settled)]
+    whole = _joined(parts, step, started, "active-set")
+    if not left:
+        return whole
+    rest = _one_by_one(problem, problem.frame(left[0]), None, options, covariance, left)
+    status, solutions = list(whole.status), list(whole.solutions)
+    for i, f in enumerate(left):
+        whole.x[f], status[f], solutions[f] = rest.x[i], rest.status[i], rest.solutions[i]
+        if covariance:
+            whole.variances[f] = rest.variances[i]
+            for mine, theirs in zip(whole.marginals, rest.marginals, strict=True):
+                mine[f] = theirs[i]
+    messages = {**whole.messages, **{left[i]: words for i, words in rest.messages.items()}}
+    return FrameResult(
+        whole.x, whole.variances, whole.marginals, tuple(status), messages, f"active-set, {rest.solver} in {len(left)} frames",
+        time.perf_counter() - started, whole.careful, tuple(solutions),
+    )  # fmt: skip
 
 
 def _all_at_once(problem: FrameProblem, covariance: bool) -> FrameResult:
@@ -335,6 +372,11 @@ def _all_at_once(problem: FrameProblem, covariance: bool) -> FrameResult:
         machine.solve(*problem.whitened_frames(slice(first, min(first + step, count))), covariance)
         for first in range(0, count, step)
     ]
+    return _joined(parts, step, started, "cholesky")
+
+
+def _joined(parts: Sequence[FrameResult], step: int, started: float, solver: str) -> FrameResult:
+    """Pieces of `step` frames as one result."""
     messages = {k * step + f: words for k, part in enumerate(parts) for f, words in part.messages.items()}
     blocks = zip(*(part.marginals for part in parts), strict=True)
     return FrameResult(
@@ -343,9 +385,10 @@ def _all_at_once(problem: FrameProblem, covariance: bool) -> FrameResult:
         tuple(np.concatenate(block) for block in blocks),
         tuple(status for part in parts for status in part.status),
         messages,
-        "cholesky",
+        solver,
         time.perf_counter() - started,
         sum(part.careful for part in parts),
+        tuple(solution for part in parts for solution in part.solutions),
     )
 
 
@@ -355,19 +398,21 @@ def _one_by_one(
     name: str | None,
     options: SolverOptions | None,
     covariance: bool,
+    chosen_frames: Sequence[int] | None = None,
 ) -> FrameResult:
     from factorgrasp.solvers.solve import default_solver
 
     started = time.perf_counter()
-    count, size = problem.frame_count, first.size
+    frames = range(problem.frame_count) if chosen_frames is None else chosen_frames
+    count, size = len(frames), first.size
     chosen: Solver = get_solver(name or default_solver(first), options)
     x, variances = np.full((count, size), np.nan), np.full((count, size if covariance else 0), np.nan)
     blocks = tuple(np.full((count, g.size, g.size), np.nan) for g in problem.marginals) if covariance else ()
     status: list[Status] = []
     solutions: list[Solution] = []
     messages: dict[int, str] = {}
-    for f in range(count):
-        system = problem.frame(f)
+    for f, frame in enumerate(frames):
+        system = problem.frame(frame)
         try:
             chosen.setup(system)
             found = chosen.solve()

@@ -8,7 +8,7 @@ from factorgrasp.online.change import Change, DetectorSettings
 from factorgrasp.online.coupled_rows import ACCELEROMETER, GYRO, shift_hand
 from factorgrasp.online.fitter import GraspFitter, columns_of
 from factorgrasp.online.jump_detector import GRASP, GUARD, REACH, STARTS, Jump, JumpDetector, Segments, explain
-from factorgrasp.online.moment_solver import Moment, batched_normals, local, retract
+from factorgrasp.online.moment_solver import Linearised, Moment, local, retract
 from factorgrasp.online.row_history import RowHistory
 from factorgrasp.online.slow_watch import SlowWatch
 from factorgrasp.problems.grasp_model import GYRO_WIDTH, GraspModel
@@ -18,8 +18,8 @@ from factorgrasp.typing import FloatArray, State
 _SLIP_EVIDENCE = 3.0
 _SLIP_SHARE = 0.05
 _SHORTEST_SLIP = 20
-# Starts are all tried at every third segment, the newest ones at each.
-_FULL_TEST, _QUICK_STARTS = 3, 4
+# Starts are all tried at every fourth segment, the newest ones whenever a segment fits badly.
+_FULL_TEST, _QUICK_STARTS = 4, 4
 # Segments of a second, roughly.
 _SECOND = 25
 # A reference this far (tangent step) from the estimate before makes its snapshots worthless.
@@ -45,16 +45,16 @@ class ChangeWatch:
         width = fitter.long.bank.width
         self._moments = RowHistory(REACH, 2 * (GYRO_WIDTH**2 + width**2))
         self._reference: State | None = None
+        self._lines: Linearised | None = None
         self._model: GraspModel = fitter.model
         self._detector = JumpDetector(fitter.model.size)
         self._slow = SlowWatch(fitter, settings, segment * _SECOND)
         self._turn = self._in_second = 0
 
-    def add(self, rows: RowHistory) -> None:
-        """A segment is complete: the newest window of two segment lengths."""
+    def add(self, time: float, coefficients: FloatArray) -> None:
+        """A segment is complete at `time`: coefficients of the newest short window."""
         self._in_second += 1
-        c = self._fitter.short.bank.coefficients(rows.last(2 * self._segment))
-        self._coefficients.append(rows.last_times(1), c.reshape(1, -1), False)
+        self._coefficients.append(np.array([time]), coefficients.reshape(1, -1), False)
         if self._reference is not None:
             self._give_segments(1)
 
@@ -90,7 +90,7 @@ class ChangeWatch:
             if np.linalg.norm(shift[:GRASP]) > _FAR:
                 self._detector.forget()
                 self._moments.run = 0
-        self._reference = fit.state
+        self._reference, self._lines = fit.state, Linearised(self._model, fit.state)
         self._detector.forget_segments()
         self._give_segments(self._coefficients.kept)
 
@@ -103,6 +103,7 @@ class ChangeWatch:
         self._slow.shift_clock(shift)
         if self._reference is not None and "time_offset" in self._reference:
             self._reference = {**self._reference, "time_offset": self._reference["time_offset"] - shift}
+            self._lines = Linearised(self._model, self._reference)
 
     def _moment_shift(self, shift: float) -> None:
         """As for the coefficients: moments Z of z become T Z T'."""
@@ -142,6 +143,8 @@ class ChangeWatch:
 
     def _find_fast(self, rows: RowHistory, settings: DetectorSettings) -> Change | None:
         self._turn = (self._turn + 1) % _FULL_TEST
+        if self._turn and not self._detector.loud():
+            return None
         starts = self._detector.starts(STARTS if self._turn == 0 else STARTS[:_QUICK_STARTS])
         if not starts:
             return None
@@ -170,8 +173,8 @@ class ChangeWatch:
         known = Moment.from_row(self._moments.last(jump.segments + GUARD)[0], self._fitter.long.bank.width)
         fit = self._fitter.with_sensor_errors(state, known)
         count = jump.segments
-        normals = batched_normals(
-            fit.model, fit.state, self._segment_moments(count), self._fitter.short.window_noise
+        normals = Linearised(fit.model, fit.state).normals(
+            self._segment_moments(count), self._fitter.short.window_noise
         )
         cost, gradient, information = (part.sum(axis=0) for part in normals)
         covariance = fit.covariance()
@@ -200,9 +203,8 @@ class ChangeWatch:
         assert self._reference is not None
         if count == 0:
             return
-        normals = batched_normals(
-            self._model, self._reference, self._segment_moments(count), self._fitter.short.window_noise
-        )
+        assert self._lines is not None
+        normals = self._lines.normals(self._segment_moments(count), self._fitter.short.window_noise)
         self._detector.add_segments(self._coefficients.last_times(count), *normals, self._fitter.short.residuals)
 
     def _before(self, jump: Jump) -> tuple[float, State, FloatArray]:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from factorgrasp.online.level import Level
-from factorgrasp.online.moment_solver import Fit, GaussianPrior, Moment, descend, evaluate
+from factorgrasp.online.moment_solver import Fit, GaussianPrior, Moment, definite, descend, evaluate
 from factorgrasp.problems.grasp_model import GraspModel
 from factorgrasp.problems.grasp_model_check import ModelCheck, check_model
 from factorgrasp.problems.grasp_settings import GraspNoise, GraspPrior, GraspSettings
@@ -25,6 +25,8 @@ GRASP_NAMES = ("rotation", "translation")
 _ENOUGH_SHORT, _ENOUGH_LONG = 2.0, 6.0
 # A warm start whose step is below this many standard deviations is there.
 _TOLERANCE = 0.5
+# Moments that are definite by so much at a review are taken to stay so until the next.
+_MARGIN = 1e-9
 # Half a turn from the present rotation lie the other local optima, if any. They are tried while data are few.
 _HALF_TURNS = np.array([np.diag(signs) for signs in ((1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, 1.0))])
 # A start that ends lower by this much of the cost (a log likelihood) is better.
@@ -55,6 +57,8 @@ class GraspFitter:
         self.prior = GaussianPrior(self._prior_mean(self.model), np.diag(prior_precision(self.model, noise, prior)))
         self.fit: Fit | None = None
         self._check: ModelCheck | None = None
+        self._covariance: tuple[Fit, FloatArray] | None = None
+        self._definite = False
         self._guess: State | None = None
 
     @property
@@ -71,15 +75,20 @@ class GraspFitter:
             return None
         if self.fit is None:
             return self._first(level, mean_force, rate_moment)
-        self.fit = descend(self.model, self.fit.state, level.moment(), self.prior, 3, _TOLERANCE)
+        self.fit = descend(
+            self.model, self.fit.state, level.moment(), self.prior, 3, _TOLERANCE, not self._definite
+        )
         return self.fit
 
     def covariance(self) -> FloatArray:
         """Covariance (n, n) of the estimate, widened where the model check found the noise model alone too narrow."""
         assert self.fit is not None
-        if self._check is None or self._check.passed:
-            return self.fit.covariance()
-        return replace(self.fit, meat=self._check.widened(self.fit.information, self.fit.meat)).covariance()
+        if self._covariance is None or self._covariance[0] is not self.fit:
+            fit = self.fit
+            if self._check is not None and not self._check.passed:
+                fit = replace(fit, meat=self._check.widened(fit.information, fit.meat))
+            self._covariance = (self.fit, fit.covariance())
+        return self._covariance[1]
 
     def review(self, young: bool, mean_force: FloatArray, rate_moment: FloatArray) -> None:
         """Weigh the bands anew, look for sensor errors and for a better optimum, and check the model."""
@@ -89,10 +98,13 @@ class GraspFitter:
         for each in {id(level): level, id(self.short): self.short}.values():
             each.refresh(self.fit, mean_force, rate_moment)
         self.fit = descend(self.model, self.fit.state, level.moment(), self.prior, 3, _TOLERANCE)
+        moment = level.moment()
+        self._definite = all(definite(Z, _MARGIN) for Z in (moment.gyro, moment.accelerometer))
         if young:
             self._try_other_starts(level)
         if self._settings.sensor_errors == "auto" and level is self.long:
             self._add_sensor_errors(level)
+        self._covariance = None
         self._check = self._checked(level) if self._settings.check_model and level is self.long else None
 
     def with_sensor_errors(self, start: State, moment: Moment) -> Fit:
@@ -122,7 +134,7 @@ class GraspFitter:
         self.prior = GaussianPrior(mean, information)
         self.short.restart()
         self.long.restart()
-        self.fit, self._check, self._guess = None, None, guess
+        self.fit, self._check, self._guess, self._definite = None, None, guess, False
 
     def _prior_mean(self, model: GraspModel) -> dict[str, FloatArray]:
         mean = {variable.name: np.zeros(variable.size) for variable in model.variables}

@@ -33,6 +33,8 @@ _SCALES = np.array([3.0, 1.0, 0.3, 0.1, 0.03])
 _UNIT = np.repeat([np.deg2rad(10.0), 0.07], 3)
 # The level of the noise is known beforehand as if from this many residuals.
 _PRIOR_RESIDUALS = 60.0
+# Whitened residual power of a single segment that is worth a test at once.
+_LOUD = 2.0
 
 
 @dataclass(frozen=True)
@@ -127,6 +129,13 @@ class JumpDetector:
         back = segments + GUARD
         row = self._snapshots.last(back)[0]
         return float(self._snapshots.last_times(back)[0]), row[: self.size], row[self.size :].reshape(self.size, self.size)
+
+    def loud(self) -> bool:
+        """Whether the newest segment fits much worse than the noise lets expect."""
+        if not self._segments.kept:
+            return False
+        cost, count = self._segments.last(1)[0, :2]
+        return bool(2.0 * cost > _LOUD * count)
 
     def jumps(self, starts: list[int], give: FloatArray) -> list[Jump]:
         """The best jump for every start, beyond changes with variances `give` (6,) that are none."""

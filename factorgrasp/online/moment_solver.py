@@ -63,8 +63,21 @@ class Fit:
 
     def covariance(self) -> FloatArray:
         """``H^-1 M H^-1`` (n, n)."""
-        bread = floored_inverse(self.information)
+        bread = inverse(self.information)
         return np.asarray(bread @ self.meat @ bread)
+
+
+def inverse(H: FloatArray) -> FloatArray:
+    """Inverse (n, n) of an information matrix with a prior in it; what holds no information at all gets a huge variance."""
+    diagonal = H.diagonal()
+    if diagonal.min() <= 0.0:
+        return floored_inverse(H)
+    scale = 1.0 / np.sqrt(diagonal)
+    try:
+        out = scale[:, None] * np.linalg.inv(scale[:, None] * H * scale) * scale
+    except np.linalg.LinAlgError:
+        return floored_inverse(H)
+    return out if out.diagonal().min() > 0.0 else floored_inverse(H)
 
 
 def retract(model: GraspModel, state: State, step: FloatArray) -> dict[str, FloatArray]:
@@ -112,25 +125,41 @@ def _rotation_between(A: FloatArray, B: FloatArray) -> FloatArray:
     return np.asarray(v if sine == 0.0 else v * (math.atan2(sine, cosine) / sine))
 
 
-def batched_normals(
-    model: GraspModel, state: State, moments: tuple[FloatArray, FloatArray], noise: tuple[FloatArray, FloatArray]
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Costs (S,), gradients (S, n) and covariances of these (S, n, n) of `moments` (S, 10, 10) and (S, m, m) with expected `noise` in each.
+class Linearised:
+    """Both residual matrices at a state, for the normal equations of many moments."""
 
-    The noise is taken out of the gradients only: the covariance of a gradient has it in, and stays positive semidefinite.
-    """
-    cost, gradient, information = np.zeros(1), np.zeros(1), np.zeros(1)
-    for L, J, Z, E in zip(model.matrices(state), model.jacobians(state), moments, noise, strict=True):
-        n, width = J.shape[0], J.shape[2]
-        JZ = np.matmul(J.reshape(-1, width), Z).reshape(-1, n, 3 * width)
-        cost = cost + 0.5 * np.matmul(np.matmul(L, Z).reshape(-1, 3 * width), L.ravel())
-        gradient = gradient + np.matmul(JZ - (J.reshape(-1, width) @ E).reshape(n, -1), L.ravel())
-        information = information + np.matmul(JZ, J.reshape(n, -1).T)
-    return cost, gradient, information
+    def __init__(self, model: GraspModel, state: State) -> None:
+        self._size = model.size
+        self._parts = tuple(
+            (L, J.reshape(-1, J.shape[2]), J.reshape(model.size, -1).T, L.ravel())
+            for L, J in zip(model.matrices(state), model.jacobians(state), strict=True)
+        )
+
+    def normals(
+        self, moments: tuple[FloatArray, FloatArray], noise: tuple[FloatArray, FloatArray]
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Costs (S,), gradients (S, n) and covariances of these (S, n, n) of `moments` (S, 10, 10) and (S, m, m) with expected `noise` in each.
+
+        The noise is taken out of the gradients only: the covariance of a gradient has it in, and stays positive semidefinite.
+        """
+        n = self._size
+        cost, gradient, information = np.zeros(1), np.zeros(1), np.zeros(1)
+        for (L, tall, wide, flat), Z, E in zip(self._parts, moments, noise, strict=True):
+            JZ = np.matmul(tall, Z).reshape(-1, n, flat.size)
+            cost = cost + 0.5 * np.matmul(np.matmul(L, Z).reshape(-1, flat.size), flat)
+            gradient = gradient + np.matmul(JZ, flat) - (tall @ E).reshape(n, -1) @ flat
+            information = information + np.matmul(JZ, wide)
+        return cost, gradient, information
 
 
 def descend(
-    model: GraspModel, start: State, moment: Moment, prior: GaussianPrior, iterations: int, tolerance: float = 1e-3
+    model: GraspModel,
+    start: State,
+    moment: Moment,
+    prior: GaussianPrior,
+    iterations: int,
+    tolerance: float = 1e-3,
+    indefinite: bool = True,
 ) -> Fit:
     """Gauss-Newton from `start` until a step is below `tolerance` standard deviations.
 
@@ -142,11 +171,15 @@ def descend(
     prior : GaussianPrior
     iterations : int
         At most.
+    indefinite : bool
+        The moments may have negative eigenvalues, since their expected noise was taken out; their positive part is used.
     tolerance : float
         The last step is still taken. It is off by its square times the curvature, which is tiny: half a standard deviation is a good tolerance
         for a warm start.
     """
-    Z_g, Z_a = _positive(moment.gyro), _positive(moment.accelerometer)
+    Z_g, Z_a = moment.gyro, moment.accelerometer
+    if indefinite:
+        Z_g, Z_a = _positive(Z_g), _positive(Z_a)
     state, cost, gained = dict(start), 0.0, 0.0
     for _ in range(iterations):
         cost, gradient, H, J_g, J_a = _normal(model, state, Z_g, Z_a, prior)
@@ -193,12 +226,21 @@ def _prior_error(model: GraspModel, prior: GaussianPrior, state: State) -> Float
     return np.concatenate(parts)
 
 
+def definite(Z: FloatArray, margin: float = 0.0) -> bool:
+    """Whether Z (m, m) is positive definite, by `margin` when its diagonal is scaled to one."""
+    scale = 1.0 / np.sqrt(np.maximum(Z.diagonal(), 1e-300))
+    scaled = scale[:, None] * Z * scale
+    scaled[np.arange(Z.shape[0]), np.arange(Z.shape[0])] -= margin
+    try:
+        np.linalg.cholesky(scaled)
+    except np.linalg.LinAlgError:
+        return False
+    return True
+
+
 def _positive(Z: FloatArray) -> FloatArray:
     """Z (m, m), or the nearest positive semidefinite matrix: taking the expected noise out can leave small negative eigenvalues."""
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(Z), 1e-300))
-    try:
-        np.linalg.cholesky(scale[:, None] * Z * scale)
-    except np.linalg.LinAlgError:
-        root = positive_part(Z)
-        return np.asarray(root @ root.T)
-    return Z
+    if definite(Z):
+        return Z
+    root = positive_part(Z)
+    return np.asarray(root @ root.T)

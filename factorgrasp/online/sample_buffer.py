@@ -56,14 +56,28 @@ class SampleBuffer:
 
     def add(self, t: FloatArray, x: FloatArray) -> None:
         """Take rows x (m, columns) with stamps t (m,)."""
-        if t.size == 0:
+        n = t.size
+        if n == 0:
             return
-        self.received += t.size
-        if t[0] > self._newest and (t.size == 1 or bool(np.all(t[1:] > t[:-1]))):
-            self._append(t, x)
+        self.received += n
+        first = float(t[0]) - self._newest
+        if n > 1:
+            steps = t[1:] - t[:-1]
+            least, most = min(first, float(steps.min())), max(first, float(steps.max()))
         else:
+            least = most = first
+        if least <= 0.0:
             self._merge(t, x)
-        self._settle()
+            self._settle()
+            return
+        whole = self._settled == self._end and most <= _HOLE * self.step
+        self._append(t, x)
+        if not whole:
+            self._settle()
+            return
+        self._settled, self._frontier = self._end, self._newest
+        if np.isnan(x).any():
+            self.incomplete += int(np.count_nonzero(np.isnan(x).any(axis=1)))
 
     def settled(self) -> tuple[FloatArray, FloatArray]:
         """Stamps and rows up to the frontier that have not been let go (views)."""

@@ -7,7 +7,7 @@ import numpy as np
 from factorgrasp.online.change import Change, DetectorSettings
 from factorgrasp.online.fitter import GraspFitter, columns_of
 from factorgrasp.online.jump_detector import JumpDetector
-from factorgrasp.online.moment_solver import batched_normals, local, retract
+from factorgrasp.online.moment_solver import Linearised, local, retract
 from factorgrasp.problems.grasp_model import GraspModel
 from factorgrasp.typing import FloatArray, State
 
@@ -41,7 +41,7 @@ class SlowWatch:
         if self._detector is None or self._reference is None or self._model is None:
             return None
         short = self._fitter.short
-        normals = batched_normals(self._model, self._reference, moments, short.window_noise)
+        normals = Linearised(self._model, self._reference).normals(moments, short.window_noise)
         count = moments[0].shape[0]
         sums = [part.sum(axis=0, keepdims=True) for part in normals]
         self._detector.add_segments(np.array([time]), sums[0], sums[1], sums[2], count * short.residuals)

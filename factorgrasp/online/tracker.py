@@ -80,12 +80,14 @@ class GraspTracker:
         half = max(2, round(0.5 * settings.window / step))
         lever_arm = np.full(3, np.linalg.norm(prior.translation) or 0.5) / np.sqrt(3.0)
 
-        def level(length: int) -> Level:
+        def level(length: int, hop: int) -> Level:
             windowing = Windowing(step, length, max(2, int(bandwidth * length * step + 1e-9) + 1))
-            bank = WindowBank(windowing, self.hop, width, settings.forgetting_time, self._loss is not None)
+            bank = WindowBank(windowing, hop, width, settings.forgetting_time, self._loss is not None)
             return Level(bank, bin_averages(robot, windowing), noise, settings, lever_arm)
 
-        self.fitter = GraspFitter(level(2 * self.segment), level(2 * half), noise, settings, prior)
+        self.fitter = GraspFitter(
+            level(2 * self.segment, self.segment), level(2 * half, self.hop), noise, settings, prior
+        )
         self.history = RowHistory((REACH + 4) * self.segment + 2 * half, row_width(settings.base_tilt))
         self._watch = None
         if detector is not None:
@@ -135,17 +137,15 @@ class GraspTracker:
         self._rates += z[:, 0:3].T @ z[:, 0:3]
 
     def _slide(self, hops: int) -> None:
-        """Windows that end with each of the last `hops` hops."""
+        """Long windows that end with each of the last `hops` hops."""
         self._pending = True
-        skip = self._since_hop
-        for level in (self.fitter.short, self.fitter.long):
-            bank = level.bank
-            wanted = (hops - 1) * self.hop + bank.windowing.length
-            usable = min(self.history.kept - skip, wanted)
-            if usable >= bank.windowing.length:
-                rows = self.history.last(usable + skip)[:usable]
-                coefficients = bank.coefficients(rows)
-                bank.add(coefficients, self._trust(level, coefficients))
+        level, skip = self.fitter.long, self._since_hop
+        length = level.bank.windowing.length
+        usable = min(self.history.kept - skip, (hops - 1) * self.hop + length)
+        if usable >= length:
+            rows = self.history.last(usable + skip)[:usable]
+            coefficients = level.bank.coefficients(rows)
+            level.bank.add(coefficients, self._trust(level, coefficients))
 
     def _trust(self, level: Level, coefficients: FloatArray) -> FloatArray | None:
         """Robust weights (N,) of windows at insertion, by their whitened residuals."""
@@ -200,8 +200,11 @@ class GraspTracker:
     def _finish_segment(self) -> None:
         if self.history.kept < 2 * self.segment:
             return
+        short = self.fitter.short
+        coefficients = short.bank.coefficients(self.history.last(2 * self.segment))
+        short.bank.add(coefficients, self._trust(short, coefficients))
         if self._watch is not None:
-            self._watch.add(self.history)
+            self._watch.add(self.time, coefficients)
             alert = bool(self._events) and self.time - self._events[-1].until < _AFTERMATH
             change = self._watch.find(self.history, alert)
             if change is not None:
@@ -239,8 +242,10 @@ class GraspTracker:
         self._count(self.history.last(kept) if kept else self.history.last(1)[:0])
         assert self._watch is not None
         self._watch.restart(kept // self.segment - 1)
-        if kept:
-            self._slide(max(kept // self.hop, 1))
+        short = self.fitter.short.bank
+        if kept >= 2 * self.segment:
+            short.add(short.coefficients(self.history.last(kept)))
+        self._slide(max(kept // self.hop, 1))
 
     def _note(self, change: Change) -> None:
         """Put a change on record; one that follows another at once is that one, going on."""

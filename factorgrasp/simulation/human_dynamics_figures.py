@@ -1,6 +1,6 @@
 """The figures and tables of the papers on human dynamics, from simulations with known truth, and the page that shows them.
 
-``python -m factorgrasp.simulation.human_dynamics_figures docs`` writes the figures into ``docs/figures`` and the tables into ``docs/human-dynamics.md``;
+``python -m factorgrasp.simulation.human_dynamics_figures docs`` writes the figures into ``docs/figures`` and the tables into ``docs/human_dynamics.md``;
 ``python -m factorgrasp.simulation.human_dynamics_figures docs robustness`` only the first of them.
 """
 
@@ -19,6 +19,7 @@ from factorgrasp import plots
 from factorgrasp.errors import InputError
 from factorgrasp.human_dynamics_task import HumanDynamicsResult, HumanDynamicsTask
 from factorgrasp.problems.external_wrenches import ExternalWrenches
+from factorgrasp.problems.human_dynamics_sensors import Sensor
 from factorgrasp.problems.human_dynamics_settings import HumanDynamicsNoise
 from factorgrasp.simulation.human_dynamics import (
     FEET,
@@ -31,9 +32,10 @@ from factorgrasp.simulation.human_dynamics import (
 from factorgrasp.typing import BoolArray, FloatArray
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-PAGE = "human-dynamics.md"
+PAGE = "human_dynamics.md"
 ARM = ("jRightShoulder", "jRightElbow", "jRightWrist")
 HAND_COVARIANCE = (1e4, 1e4, 1e4, 1.0, 1.0, 1.0)
 """Of unmeasured contacts: forces free, moments about where the hand holds small."""
@@ -80,7 +82,7 @@ def solve_recording(
     """
     motion, keep, own = recording.measured_motion
     chosen = replace(own, contact_wrench=HAND_COVARIANCE) if noise is None else noise
-    made: dict[str, Callable[[], list[object]]] = {
+    made: dict[str, Callable[[], list[Sensor]]] = {
         "plates": lambda: [*recording.foot_sensors(motion, keep)],
         "imus": lambda: [*recording.imus(keep)],
         "hands": lambda: [*recording.hand_sensors(keep)],
@@ -89,7 +91,7 @@ def solve_recording(
     points = {link: recording.body.segments[link].com for link in contacts}
     task = HumanDynamicsTask(
         motion,
-        every,  # type: ignore[arg-type]
+        every,
         recording.t,
         keep,
         noise=chosen,
@@ -117,25 +119,43 @@ def robustness(seed: int = 0, torso_mass: float = 6.0) -> Shown:
         found, _ = _torques(with_mass, HumanDynamicsNoise.latella2018(model), names)
         series[label] = np.abs(found - base) - truth[keep]
         errors[label] = np.sqrt(np.mean(series[label] ** 2, axis=0))
-    series["inverse dynamics"] = np.abs(_without_feet(with_mass, names) - _without_feet(without, names))[keep] - truth[keep]
+    series["inverse dynamics"] = (
+        np.abs(_without_feet(with_mass, names) - _without_feet(without, names))[keep] - truth[keep]
+    )
     errors["inverse dynamics"] = np.sqrt(np.mean(series["inverse dynamics"] ** 2, axis=0))
     rows = []
     for k, joint in enumerate([*joints, "L5/S1"]):
         at = slice(2 * k, 2 * k + 2) if k < len(joints) else slice(2 * k, 2 * k + 1)
-        sizes = [f"{np.sqrt(np.mean(errors[label][at] ** 2)):.2f}" for label in ("inverse dynamics", "model 1e-4", "model 1e-1")]
+        sizes = [
+            f"{np.sqrt(np.mean(errors[label][at] ** 2)):.2f}"
+            for label in ("inverse dynamics", "model 1e-4", "model 1e-1")
+        ]
         rows.append((joint, f"{np.sqrt(np.mean(truth[:, at] ** 2)):.2f}", *sizes))
     t = with_mass.t[keep]
     made, axes = plots.figure(7.2, 2.4, columns=2, sharey=True)
     for ax, k, title in ((axes[0], 0, "Right ankle"), (axes[1], 4, "Right hip")):
-        curves = [(label, series[label][:, k], colour) for label, colour in zip(series, ("x", "z", "accent"), strict=False)]
+        curves = [
+            (label, series[label][:, k], colour)
+            for label, colour in zip(series, ("x", "z", "accent"), strict=False)
+        ]
         _curves(ax, title, "error (Nm)", t, curves)
-    header = ("joint", "torque of the mass (Nm)", "ID, no plates: error", "MAP, model 1e-4: error", "MAP, model 1e-1: error")
+    header = (
+        "joint",
+        "torque of the mass (Nm)",
+        "ID, no plates: error",
+        "MAP, model 1e-4: error",
+        "MAP, model 1e-1: error",
+    )
     return Shown(header, tuple(rows), made)
 
 
-def _torques(recording: HumanRecording, noise: HumanDynamicsNoise, names: Sequence[str]) -> tuple[FloatArray, BoolArray]:
+def _torques(
+    recording: HumanRecording, noise: HumanDynamicsNoise, names: Sequence[str]
+) -> tuple[FloatArray, BoolArray]:
     own = recording.measured_motion[2]
-    joined = replace(noise, joint_acceleration=own.joint_acceleration, link_acceleration=own.link_acceleration)
+    joined = replace(
+        noise, joint_acceleration=own.joint_acceleration, link_acceleration=own.link_acceleration
+    )
     result, keep = solve_recording(recording, joined, sensors=("plates", "imus"))
     return result.frames.torque[:, [result.frames.dof_names.index(name) for name in names]], keep
 
@@ -168,17 +188,16 @@ def sensor_sets(subjects: int = 10, seed: int = 0) -> Shown:
             variances[s, k] = np.mean(result.frames.torque_sd[:, at] ** 2, axis=0)
     mean = variances.mean(axis=0)
     rows = tuple(
-        (label, *(f"{value:.3g}" for value in mean[k]), " + ".join(sensors)) for k, (label, sensors) in enumerate(sets.items())
+        (label, *(f"{value:.3g}" for value in mean[k]), " + ".join(sensors))
+        for k, (label, sensors) in enumerate(sets.items())
     )
     made, (ax,) = plots.figure(7.2, 2.4)
-    for j, name in enumerate(names):
-        colour = plots.PALETTE["z" if "Ankle" in name else "accent"]
-        ax.bar(np.arange(len(sets)) + 0.2 * (j - 1.5), mean[:, j], 0.18, color=colour, alpha=1.0 if "Right" in name else 0.6, label=name)
-    ax.set_yscale("log")
-    ax.set_xticks(range(len(sets)), list(sets))
-    ax.set_ylabel("variance of the torque (Nm²)")
-    ax.legend(ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1.0))
-    return Shown(("", "right ankle (Nm²)", "left ankle", "right hip", "left hip", "accelerations of joints and"), rows, made)
+    _bars(ax, tuple(sets), names, mean)
+    return Shown(
+        ("", "right ankle (Nm²)", "left ankle", "right hip", "left hip", "accelerations of joints and"),
+        rows,
+        made,
+    )
 
 
 def tpose_efforts(seed: int = 0) -> Shown:
@@ -196,16 +215,36 @@ def tpose_efforts(seed: int = 0) -> Shown:
         found = _effort(result.frames.torque, result.frames.dof_names)
         plain = _effort(blind.frames.torque, blind.frames.dof_names)
         for k, joint in enumerate(ARM):
-            cells = [ideal[0, k], true[keep][during, k].mean(), found[during, k].mean(), plain[during, k].mean()]
-            rows.append((f"{payload:.0f} kg", joint.removeprefix("jRight").lower(), *(f"{value:.2f}" for value in cells)))
+            cells = [
+                ideal[0, k],
+                true[keep][during, k].mean(),
+                found[during, k].mean(),
+                plain[during, k].mean(),
+            ]
+            rows.append(
+                (
+                    f"{payload:.0f} kg",
+                    joint.removeprefix("jRight").lower(),
+                    *(f"{value:.2f}" for value in cells),
+                )
+            )
         panels.append((payload, recording.t[keep], found, true[keep]))
     made, axes = plots.figure(7.2, 2.4, columns=2)
     for ax, (payload, t, found, true) in zip(axes, panels, strict=True):
-        curves = [(joint.removeprefix("jRight").lower(), found[:, k], "xyz"[k]) for k, joint in enumerate(ARM)]
+        curves = [
+            (joint.removeprefix("jRight").lower(), found[:, k], "xyz"[k]) for k, joint in enumerate(ARM)
+        ]
         _curves(ax, f"Effort of the right arm, {payload:.0f} kg in the hand", "Nm", t, curves)
         for k in range(len(ARM)):
             ax.plot(t, true[:, k], color=plots.PALETTE["ink"], linewidth=0.7, linestyle=(0, (3, 3)))
-    header = ("payload", "joint", "ideal T-pose (Nm)", "truth (Nm)", "estimate (Nm)", "hand taken to be free (Nm)")
+    header = (
+        "payload",
+        "joint",
+        "ideal T-pose (Nm)",
+        "truth (Nm)",
+        "estimate (Nm)",
+        "hand taken to be free (Nm)",
+    )
     return Shown(header, tuple(rows), made)
 
 
@@ -237,18 +276,37 @@ def hand_covariances(seed: int = 0) -> Shown:
     for variance, colour in zip((1e-4, 1e-2, 1.0, 1e2, 1e4), ("x", "accent", "y", "z", "ink"), strict=True):
         noise = replace(own, contact_wrench=(variance,) * 3 + (1e4,) * 3)
         paper = ExternalWrenches(
-            motion, [replace(s, covariance=1e-6) for s in feet], ("RightHand",), replace(noise, free_wrench=1e-6), 1e-3
+            motion,
+            [replace(s, covariance=1e-6) for s in feet],
+            ("RightHand",),
+            replace(noise, free_wrench=1e-6),
+            1e-3,
         ).estimate()
         force = np.linalg.norm(paper.of("RightHand")[:, :3], axis=1) / 9.80665
         ours, _ = solve_recording(recording, noise, ("RightHand",), ("RightHand",))
         assert ours.payload is not None
         unshrunk = ours.payload.mass[during]
-        joint = np.linalg.norm(ours.frames.external_wrench[:, ours.frames.links.index("RightHand"), :3], axis=1) / 9.80665
-        rows.append((f"{variance:.0e}", f"{force[during].mean():.2f}", f"{joint[during].mean():.2f}", f"{np.nanmean(unshrunk):.2f}"))
+        joint = (
+            np.linalg.norm(ours.frames.external_wrench[:, ours.frames.links.index("RightHand"), :3], axis=1)
+            / 9.80665
+        )
+        rows.append(
+            (
+                f"{variance:.0e}",
+                f"{force[during].mean():.2f}",
+                f"{joint[during].mean():.2f}",
+                f"{np.nanmean(unshrunk):.2f}",
+            )
+        )
         curves.append((f"{variance:.0e}", force, colour))
     made, (ax,) = plots.figure(7.2, 2.4)
     _curves(ax, "Mass from the hand's force, by its covariance (N²)", "kg", recording.t[keep], curves)
-    header = ("covariance of the hand's force (N²)", "non-collocated, feet 1e-6, momentum 1e-3 (kg)", "joint estimate (kg)", "payload, prior taken out (kg)")
+    header = (
+        "covariance of the hand's force (N²)",
+        "non-collocated, feet 1e-6, momentum 1e-3 (kg)",
+        "joint estimate (kg)",
+        "payload, prior taken out (kg)",
+    )
     return Shown(header, tuple(rows), made)
 
 
@@ -276,7 +334,13 @@ def carrying(seed: int = 0) -> Shown:
         if motion != "standing":
             ax = axes[0] if motion == "one_foot" else axes[1]
             t = recording.t[keep]
-            _curves(ax, f"Mass in both hands, {motion.replace('_', ' ')}", "kg", t, [("feet minus body", paper, "x"), ("estimate", mass, "z")])
+            _curves(
+                ax,
+                f"Mass in both hands, {motion.replace('_', ' ')}",
+                "kg",
+                t,
+                [("feet minus body", paper, "x"), ("estimate", mass, "z")],
+            )
             ax.axhline(9.55, color=plots.PALETTE["ink"], linewidth=0.8)
     header = ("phase", "force of the feet less the body (kg)", "estimate (kg)", "stated sd of a frame (kg)")
     return Shown(header, tuple(rows), made)
@@ -316,27 +380,57 @@ def write_page(folder: Path, names: Sequence[str] = tuple(FIGURES)) -> list[Path
         if shown.figure is not None:
             path = folder / "figures" / f"human_dynamics_{name}.svg"
             with replacing(path) as temporary:
-                shown.figure.savefig(temporary, format="svg", facecolor=plots.PALETTE["paper"], metadata={"Date": None})
+                shown.figure.savefig(
+                    temporary, format="svg", facecolor=plots.PALETTE["paper"], metadata={"Date": None}
+                )
             written.append(path)
     return [*written, write_text(page, text)]
 
 
 @plots.styled
-def _curves(ax: object, title: str, unit: str, t: FloatArray, curves: Sequence[tuple[str, FloatArray, str]]) -> None:
-    from matplotlib.axes import Axes
+def _bars(ax: Axes, groups: Sequence[str], names: Sequence[str], heights: FloatArray) -> None:
+    for j, name in enumerate(names):
+        colour = plots.PALETTE["z" if "Ankle" in name else "accent"]
+        shade = 1.0 if "Right" in name else 0.6
+        ax.bar(
+            np.arange(len(groups)) + 0.2 * (j - 1.5),
+            heights[:, j],
+            0.18,
+            color=colour,
+            alpha=shade,
+            label=name,
+        )
+    ax.set_xticks(range(len(groups)), list(groups))
+    ax.set_ylabel("variance of the torque (Nm²)")
+    ax.legend(ncols=4, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.0)
 
-    assert isinstance(ax, Axes)
+
+@plots.styled
+def _curves(
+    ax: Axes, title: str, unit: str, t: FloatArray, curves: Sequence[tuple[str, FloatArray, str]]
+) -> None:
     for label, values, colour in curves:
         ax.plot(t, values, color=plots.PALETTE[colour], label=label, linewidth=1.0)
     ax.set_title(title)
     ax.set_ylabel(unit)
     ax.set_xlabel("time (s)")
-    ax.legend(ncols=1, loc="upper right", fontsize=7.5)
+    ax.margins(y=0.12)
+    ax.legend(
+        ncols=2 if len(curves) < 4 else 3,
+        loc="upper right",
+        fontsize=7.0,
+        frameon=True,
+        framealpha=0.85,
+        edgecolor="none",
+        handlelength=1.2,
+    )
 
 
 def main() -> None:
     """Command line."""
-    parser = argparse.ArgumentParser(description="Draw the figures of the human-dynamics page and renew its tables.")
+    parser = argparse.ArgumentParser(
+        description="Draw the figures of the human-dynamics page and renew its tables."
+    )
     parser.add_argument("folder", type=Path, help=f"folder with {PAGE}")
     parser.add_argument("names", nargs="*", default=list(FIGURES), help="of: " + ", ".join(FIGURES))
     arguments = parser.parse_args()

@@ -41,6 +41,18 @@ scenarios: dict[str, Scenario] = {
         "factorgrasp.simulation.cehajic2015:grasp_regrasp",
         "grasp pose as in cehajic2015, and the hand takes another grasp half way (default 10 deg, 70 mm)",
     ),
+    "human_bowing": Scenario(
+        "factorgrasp.simulation.human_dynamics:human_bowing",
+        "human dynamics, bowing on two plates (Latella 2018; options torso_mass=6 kg, push in N on a robot's arms)",
+    ),
+    "human_carrying": Scenario(
+        "factorgrasp.simulation.human_dynamics:human_carrying",
+        "human dynamics, 9.55 kg in both hands (Tirupachuri 2021; option motion='standing' | 'one_foot' | 'walking')",
+    ),
+    "human_tpose": Scenario(
+        "factorgrasp.simulation.human_dynamics:human_tpose",
+        "human dynamics, arms to the T-pose and back (Tirupachuri 2021; option payload=5 kg in the right hand)",
+    ),
     "grasp_slip": Scenario(
         "factorgrasp.simulation.cehajic2015:grasp_slip",
         "grasp pose as in cehajic2015, and the hand slips slowly along the object (default 20 mm, 3 deg in 20 s)",

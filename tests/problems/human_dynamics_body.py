@@ -19,7 +19,9 @@ def body(floating: bool = True, kinds: str = "ball") -> Any:
     root = 0
     if floating:
         root = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "root_joint")
-    inertia = lambda mass: pin.Inertia.FromBox(mass, 0.2, 0.3, 0.4)
+
+    def inertia(mass: float) -> Any:
+        return pin.Inertia.FromBox(mass, 0.2, 0.3, 0.4)
 
     def place(x: float, y: float, z: float) -> Any:
         return pin.SE3(pin.exp3(0.2 * rng.standard_normal(3)), np.array([x, y, z]))

@@ -277,7 +277,7 @@ def test_a_walk_without_width_is_a_static_grasp(still: GraspRecording) -> None:
     )
 
 
-@pytest.mark.parametrize("solver", ["piqp", "gtsam", "gtsam-gauss-newton"])
+@pytest.mark.parametrize("solver", ["clarabel", "gtsam", "gtsam-gauss-newton"])
 def test_solvers_agree_on_a_grasp_that_wanders(solver: str) -> None:
     recording = wandering(6, 1e-3, duration=16.0)
     settled = solve(GraspSegments(posed(recording), 2.0, 1e-3, 1e-3)).problem

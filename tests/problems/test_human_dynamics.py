@@ -381,8 +381,14 @@ def test_equal_to_idyntree() -> None:
 
 
 def _chain_urdf() -> str:
-    link = '<link name="l{i}"><inertial><mass value="{m}"/><origin xyz="0.02 0.01 0.2" rpy="0 0 0"/><inertia ixx="0.2" iyy="0.25" izz="0.1" ixy="0.01" ixz="0" iyz="0"/></inertial></link>'
-    joint = '<joint name="j{i}" type="revolute"><parent link="l{p}"/><child link="l{i}"/><origin xyz="0.05 0 0.4" rpy="0.2 0.1 0"/><axis xyz="{a}"/><limit effort="9" velocity="9" lower="-9" upper="9"/></joint>'
+    link = (
+        '<link name="l{i}"><inertial><mass value="{m}"/><origin xyz="0.02 0.01 0.2" rpy="0 0 0"/>'
+        '<inertia ixx="0.2" iyy="0.25" izz="0.1" ixy="0.01" ixz="0" iyz="0"/></inertial></link>'
+    )
+    joint = (
+        '<joint name="j{i}" type="revolute"><parent link="l{p}"/><child link="l{i}"/><origin xyz="0.05 0 0.4" rpy="0.2 0.1 0"/>'
+        '<axis xyz="{a}"/><limit effort="9" velocity="9" lower="-9" upper="9"/></joint>'
+    )
     parts = [link.format(i=i, m=3.0 + i) for i in range(5)]
     axes = ("0 1 0", "1 0 0", "0 0 1", "0 1 0")
     parts += [joint.format(i=i, p=(0, 1, 2, 1)[i - 1], a=axes[i - 1]) for i in range(1, 5)]
