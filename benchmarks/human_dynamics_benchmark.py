@@ -291,10 +291,10 @@ def _ours(
 
     joint_estimate()
     results[f"{name}: both tasks as one joint estimate, many frames"] = (
-        median(lambda _: joint_estimate(), 3)[0] / n
+        median(lambda _: joint_estimate(), 5)[0] / n
     )
     both()
-    results[f"{name}: both tasks chained with covariance, many frames"] = median(lambda _: both(), 2)[0] / n
+    results[f"{name}: both tasks chained with covariance, many frames"] = median(lambda _: both(), 3)[0] / n
     if name == "ball joints":
         few = slice(0, 100)
         free = solve_frames(whole.at(few), covariance=False)
@@ -307,13 +307,13 @@ def _ours(
         for solver in ("active-set", "piqp"):
             found = solve_frames(bound, solver, covariance=False)
             results[f"ball joints: {solver} with torque limits, one frame"] = found.time / len(found)
-            results[f"ball joints: active limits by {solver}"] = float(len(found.active))
+            results[f"ball joints: rows at their limit by {solver}"] = float(len(found.active))
 
 
 def _report(results: dict[str, float], peer: dict[str, float], frames: int) -> None:
     print(f"{frames} frames, one thread; {_machine()}")
     for name, value in results.items():
-        plain = any(word in name for word in ("unknowns", "difference", "active"))
+        plain = any(word in name for word in ("unknowns", "difference", "rows at"))
         line = f"  {name:72s} {value:10.3g}" if plain else f"  {name:72s} {1e3 * value:8.4f} ms"
         if (
             peer

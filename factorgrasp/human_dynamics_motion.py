@@ -145,7 +145,8 @@ def _span(t: FloatArray, motion: Mapping[str, Any]) -> BoolArray:
 
 
 _JOINT_KEYS = (
-    "file", "columns", "translations", "rate", "bandwidth", "others", "angle_sd", "position_sd", "orientation_sd", "start", "end", "max_gap",
+    "file", "columns", "translations", "rate", "bandwidth", "others", "angle_sd", "position_sd", "orientation_sd",
+    "start", "end", "max_gap",
 )  # fmt: skip
 
 

@@ -44,7 +44,8 @@ class Payload:
     @property
     def words(self) -> str:
         """A sentence."""
-        return f"{' and '.join(self.links)} hold {self.mean:.3f} kg (sd {self.mean_sd:.3f} kg in one frame)"
+        verb = "holds" if len(self.links) == 1 else "hold"
+        return f"{' and '.join(self.links)} {verb} {self.mean:.3f} kg (sd {self.mean_sd:.3f} kg in one frame)"
 
 
 def contact_rows(
@@ -152,7 +153,8 @@ def payload_of(
     holds a zero-mean prior (the noise's `contact_wrench` and `prior_external_wrench`), which draws masses towards zero. It is taken out:
     with the posterior ``N(mu, P)`` and the prior ``N(0, P0)`` the data alone say ``F = (P^-1 - P0^-1)^-1 P^-1 mu``, and ``m = F' u / u' u``
     with ``u = g - a``. Weighting the components of F by their covariance would use them better if u were exact; with the noise of a, the
-    well-known horizontal ones bias the mass by several per cent. Errors of different hands go with each other: their joint covariance is used.
+    well-known horizontal ones bias the mass by several per cent. Errors of different hands go with each other: their joint covariance
+    is used.
     """
     at = [motion.link(link) for link in links]
     R = motion.R[:, at]

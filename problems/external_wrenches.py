@@ -23,7 +23,7 @@ from factorgrasp.problems.human_dynamics_names import wrench_on
 from factorgrasp.problems.human_dynamics_rows import sensor_rows
 from factorgrasp.problems.human_dynamics_sensors import ExternalWrench
 from factorgrasp.problems.human_dynamics_settings import HumanDynamicsNoise, PerName, resolve
-from factorgrasp.problems.human_dynamics_system import WRENCH
+from factorgrasp.problems.human_dynamics_terms import WRENCH
 from factorgrasp.problems.link_motion import LinkMotion
 from factorgrasp.problems.link_motion_spatial import skew
 from factorgrasp.typing import FloatArray

@@ -22,19 +22,12 @@ from factorgrasp.problems.human_dynamics_names import (
 )
 from factorgrasp.problems.human_dynamics_rows import SensorRows, sensor_rows
 from factorgrasp.problems.human_dynamics_sensors import Sensor
-from factorgrasp.problems.human_dynamics_settings import HumanDynamicsNoise, resolve
+from factorgrasp.problems.human_dynamics_settings import HumanDynamicsNoise
+from factorgrasp.problems.human_dynamics_terms import MOTION, DynamicsTerms
 from factorgrasp.problems.link_motion import BodyTree, LinkKinematics
 from factorgrasp.problems.link_motion_spatial import centripetal, velocity_wrench
 from factorgrasp.typing import BoolArray, FloatArray, IntArray
 from factorgrasp.uncertainty import Covariance
-from factorgrasp.variables import Variable
-
-_MOTION = np.ones((6, 6), dtype=bool)
-_MOTION[3:, :3] = False
-"""Pattern of a motion transform; that of a wrench is its transpose."""
-
-ACCELERATION = ("linear x", "linear y", "linear z", "angular x", "angular y", "angular z")
-WRENCH = ("force x", "force y", "force z", "moment x", "moment y", "moment z")
 
 Writer = Callable[[LinkKinematics], FloatArray]
 
@@ -97,7 +90,8 @@ class HumanDynamicsSystem:
             if link not in tree.links:
                 raise InputError("contacts", "links among " + ", ".join(tree.links), repr(link))
         self.axes = tuple(j for j, dofs in enumerate(tree.dofs) if dofs)
-        variables = self._variables()
+        self._terms = DynamicsTerms(tree, self.noise, self.contacts)
+        variables = self._terms.variables()
         self._sensor_rows: list[SensorRows] = [sensor_rows(tree, sensor) for sensor in sensors]
         names = [rows.name for rows in self._sensor_rows]
         if len(set(names)) != len(names):
@@ -105,8 +99,8 @@ class HumanDynamicsSystem:
             raise InputError(
                 "sensors", "unique names", ", ".join(twice) + " more than once", "Give each its own name="
             )
-        dynamics = self._dynamics_terms()
-        kinematic = self._kinematic_terms(sensors) if use_motion else []
+        dynamics = self._terms.dynamics()
+        kinematic = self._terms.kinematic(sensors) if use_motion else []
         measured = [
             Term(
                 r.name, r.size, tuple(r.patterns), self._first_covariance(r), pattern=r.patterns, unit=r.unit
@@ -117,8 +111,8 @@ class HumanDynamicsSystem:
             *([] if hard_dynamics else dynamics),
             *kinematic,
             *measured,
-            *self._zero_terms(sensors),
-            *self._prior_terms(variables),
+            *self._terms.zero(sensors),
+            *self._terms.prior(variables),
         ]
         hard = (
             [Constraint(t.name, t.rows, t.variables, "equality", t.pattern, t.unit) for t in dynamics]
@@ -159,26 +153,6 @@ class HumanDynamicsSystem:
         """Unknowns that a sensor's rows touch."""
         return np.concatenate([np.arange(self.pattern.size)[self.pattern.columns[v]] for v in rows.patterns])
 
-    def _variables(self) -> list[Variable]:
-        tree = self.tree
-        out = [
-            Variable(acceleration_of(link), 6, unit="m/s^2, rad/s^2", components=ACCELERATION)
-            for i, link in enumerate(tree.links)
-            if not (tree.fixed_base and i == tree.root)
-        ]
-        out += [Variable(wrench_on(link), 6, unit="N, Nm", components=WRENCH) for link in tree.links]
-        out += [Variable(wrench_of(joint), 6, unit="N, Nm", components=WRENCH) for joint in tree.joints]
-        out += [
-            Variable(
-                joint_acceleration_of(tree.joints[j]),
-                len(tree.dofs[j]),
-                unit="rad/s^2",
-                components=tree.dofs[j],
-            )
-            for j in self.axes
-        ]
-        return out
-
     def _columns(self) -> Columns:
         tree, where = self.tree, self.pattern.columns
 
@@ -191,170 +165,6 @@ class HumanDynamicsSystem:
             np.array([of(wrench_of(joint)) for joint in tree.joints]).reshape(-1, 6),
             tuple(of(joint_acceleration_of(joint), 0) for joint in tree.joints),
         )
-
-    def _dynamics_terms(self) -> list[Term]:
-        tree, noise = self.tree, self.noise
-        eye = np.eye(6, dtype=bool)
-        joints = [tree.joints[j] for j in self.axes]
-        propagation = resolve(noise.propagation, joints, [6] * len(joints), "propagation variance")
-        balance = resolve(noise.balance, tree.links, [6] * len(tree.links), "balance variance")
-        terms = []
-        for j, variance in zip(self.axes, propagation, strict=True):
-            pattern = {acceleration_of(tree.links[tree.children[j]]): eye}
-            if not self._given(tree.parents[j]):
-                pattern[acceleration_of(tree.links[tree.parents[j]])] = _MOTION
-            S = tree.subspaces[j]
-            pattern[joint_acceleration_of(tree.joints[j])] = (
-                np.ones((6, len(tree.dofs[j])), dtype=bool) if S is None else S != 0.0
-            )
-            name = f"propagation through {tree.joints[j]}"
-            terms.append(
-                Term(
-                    name,
-                    6,
-                    tuple(pattern),
-                    Covariance.diagonal(variance),
-                    pattern=pattern,
-                    unit="m/s^2, rad/s^2",
-                )
-            )
-        for i, link in enumerate(tree.links):
-            pattern = {wrench_on(link): eye}
-            if not self._given(i) and np.any(tree.spatial_inertia[i]):
-                pattern[acceleration_of(link)] = tree.spatial_inertia[i] != 0.0
-            for j, joint in enumerate(tree.joints):
-                if tree.children[j] == i:
-                    pattern[wrench_of(joint)] = eye
-                elif tree.parents[j] == i:
-                    pattern[wrench_of(joint)] = _MOTION.T
-            terms.append(
-                Term(
-                    f"balance of {link}",
-                    6,
-                    tuple(pattern),
-                    Covariance.diagonal(balance[i]),
-                    pattern=pattern,
-                    unit="N, Nm",
-                )
-            )
-        return terms
-
-    def _given(self, link: int) -> bool:
-        return self.tree.fixed_base and link == self.tree.root
-
-    def _kinematic_terms(self, sensors: Sequence[Sensor]) -> list[Term]:
-        tree, noise = self.tree, self.noise
-        have = {(sensor.kind, sensor.where) for sensor in sensors}
-        self._motion_joints = [j for j in self.axes if ("joint acceleration", tree.joints[j]) not in have]
-        behind = {int(tree.children[j]) for j, dofs in enumerate(tree.dofs) if not dofs}
-        if not tree.fixed_base:
-            behind.add(tree.root)
-        self._motion_links = [i for i in sorted(behind) if ("link acceleration", tree.links[i]) not in have]
-        names = [tree.joints[j] for j in self.axes]
-        spread = resolve(
-            noise.joint_acceleration,
-            names,
-            [len(tree.dofs[j]) for j in self.axes],
-            "joint acceleration variance",
-        )
-        by_joint = dict(zip(self.axes, spread, strict=True))
-        by_link = resolve(
-            noise.link_acceleration, tree.links, [6] * len(tree.links), "link acceleration variance"
-        )
-        terms = []
-        for j in self._motion_joints:
-            name = joint_acceleration_of(tree.joints[j])
-            size = len(tree.dofs[j])
-            pattern = {name: np.eye(size, dtype=bool)}
-            terms.append(
-                Term(
-                    f"motion: {name}",
-                    size,
-                    (name,),
-                    Covariance.diagonal(by_joint[j]),
-                    pattern=pattern,
-                    unit="rad/s^2",
-                )
-            )
-        for i in self._motion_links:
-            name = acceleration_of(tree.links[i])
-            terms.append(
-                Term(
-                    f"motion: {name}",
-                    6,
-                    (name,),
-                    Covariance.diagonal(by_link[i]),
-                    pattern={name: np.eye(6, dtype=bool)},
-                )
-            )
-        return terms
-
-    def _zero_terms(self, sensors: Sequence[Sensor]) -> list[Term]:
-        tree = self.tree
-        measured = {
-            link
-            for s in sensors
-            if s.kind.startswith("external wrench")
-            for link in getattr(s, "links", (s.where,))
-        }
-        twice = measured & set(self.contacts)
-        if twice:
-            raise InputError(
-                "contacts",
-                "links without a wrench sensor",
-                ", ".join(sorted(twice)),
-                "A measured wrench needs no entry here",
-            )
-        free = resolve(self.noise.free_wrench, tree.links, [6] * len(tree.links), "free wrench variance")
-        loose = resolve(
-            self.noise.contact_wrench, tree.links, [6] * len(tree.links), "contact wrench variance"
-        )
-        terms = []
-        for i, link in enumerate(tree.links):
-            if link in measured:
-                continue
-            touched = link in self.contacts
-            name = f"unmeasured wrench on {link}" if touched else f"no wrench on {link}"
-            pattern = {wrench_on(link): np.eye(6, dtype=bool)}
-            variance = loose[i] if touched else free[i]
-            terms.append(
-                Term(
-                    name, 6, (wrench_on(link),), Covariance.diagonal(variance), pattern=pattern, unit="N, Nm"
-                )
-            )
-        return terms
-
-    def _prior_terms(self, variables: Sequence[Variable]) -> list[Term]:
-        tree, noise = self.tree, self.noise
-        links = [6] * len(tree.links)
-        by_name: dict[str, FloatArray] = {}
-        for name, variance in zip(
-            tree.links,
-            resolve(noise.prior_link_acceleration, tree.links, links, "prior variance"),
-            strict=True,
-        ):
-            by_name[acceleration_of(name)] = variance
-        for name, variance in zip(
-            tree.links, resolve(noise.prior_external_wrench, tree.links, links, "prior variance"), strict=True
-        ):
-            by_name[wrench_on(name)] = variance
-        joints = resolve(noise.prior_joint_wrench, tree.joints, [6] * len(tree.joints), "prior variance")
-        for name, variance in zip(tree.joints, joints, strict=True):
-            by_name[wrench_of(name)] = variance
-        names = [tree.joints[j] for j in self.axes]
-        sizes = [len(tree.dofs[j]) for j in self.axes]
-        for name, variance in zip(
-            names, resolve(noise.prior_joint_acceleration, names, sizes, "prior variance"), strict=True
-        ):
-            by_name[joint_acceleration_of(name)] = variance
-        out = []
-        for v in variables:
-            covariance = Covariance.diagonal(by_name[v.name])
-            pattern = {v.name: np.eye(v.size, dtype=bool)}
-            out.append(
-                Term(f"prior of {v.name}", v.size, (v.name,), covariance, pattern=pattern, unit=v.unit)
-            )
-        return out
 
     @staticmethod
     def _first_covariance(rows: SensorRows) -> Covariance:
@@ -386,7 +196,7 @@ class HumanDynamicsSystem:
             joint = tree.joints[j]
             rows = f"propagation through {joint}"
             put(rows, acceleration_of(tree.links[tree.children[j]]), np.eye(6))
-            if not self._given(tree.parents[j]):
+            if not self._terms.given(tree.parents[j]):
                 through.append((j, dynamics.places(rows, acceleration_of(tree.links[tree.parents[j]]))))
             S = tree.subspaces[j]
             if S is not None:
@@ -396,7 +206,7 @@ class HumanDynamicsSystem:
         for i, link in enumerate(tree.links):
             rows = f"balance of {link}"
             put(rows, wrench_on(link), -np.eye(6))
-            if not self._given(i) and np.any(tree.spatial_inertia[i]):
+            if not self._terms.given(i) and np.any(tree.spatial_inertia[i]):
                 put(rows, acceleration_of(link), tree.spatial_inertia[i])
         for j, joint in enumerate(tree.joints):
             put(f"balance of {tree.links[tree.children[j]]}", wrench_of(joint), -np.eye(6))
@@ -432,20 +242,17 @@ class HumanDynamicsSystem:
         self._propagation = _rows(where, [f"propagation through {tree.joints[j]}" for j in self.axes])
         self._balance = _rows(where, [f"balance of {link}" for link in tree.links])
         slices = pattern.jacobian.slices
-        have = hasattr(self, "_motion_joints")
         self._motion_rows = _rows(
             slices,
-            [f"motion: {joint_acceleration_of(tree.joints[j])}" for j in self._motion_joints] if have else [],
+            [f"motion: {joint_acceleration_of(tree.joints[j])}" for j in self._terms.motion_joints],
         )
         self._motion_link_rows = _rows(
-            slices, [f"motion: {acceleration_of(tree.links[i])}" for i in self._motion_links] if have else []
+            slices, [f"motion: {acceleration_of(tree.links[i])}" for i in self._terms.motion_links]
         )
-        if have:
-            ends = np.cumsum([0, *(len(tree.dofs[j]) for j in self.axes)])
-            at = {j: np.arange(ends[k], ends[k + 1]) for k, j in enumerate(self.axes)}
-            self._motion_dofs = np.concatenate(
-                [at[j] for j in self._motion_joints] or [np.empty(0, dtype=np.intp)]
-            ).astype(np.intp)
+        ends = np.cumsum([0, *(len(tree.dofs[j]) for j in self.axes)])
+        at = {j: np.arange(ends[k], ends[k + 1]) for k, j in enumerate(self.axes)}
+        chosen = [at[j] for j in self._terms.motion_joints]
+        self._motion_dofs: IntArray = np.concatenate([*chosen, np.empty(0, dtype=np.intp)]).astype(np.intp)
         self._sensor_range = _rows(slices, [rows.name for rows in self._sensor_rows])
         indptr = pattern.jacobian.matrix.indptr
         first = self._sensor_range.start
@@ -487,9 +294,9 @@ class HumanDynamicsSystem:
         rhs = np.zeros((count, pattern.jacobian.height))
         if not self.hard_dynamics:
             rhs[:, self._propagation], rhs[:, self._balance] = self._dynamics_rhs(k)
-        if hasattr(self, "_motion_joints"):
-            rhs[:, self._motion_rows] = k.joint_acceleration[:, self._motion_dofs]
-            rhs[:, self._motion_link_rows] = k.acceleration[:, self._motion_links].reshape(count, -1)
+        rhs[:, self._motion_rows] = k.joint_acceleration[:, self._motion_dofs]
+        if self._terms.motion_links:
+            rhs[:, self._motion_link_rows] = k.acceleration[:, self._terms.motion_links].reshape(count, -1)
         if not self._sensor_rows:
             return entries, rhs
         right = values.copy()
@@ -551,13 +358,13 @@ def _minus_axes(tree: BodyTree, joints: Sequence[int]) -> Writer:
 
 
 def _minus_transform(joints: IntArray) -> Writer:
-    rows, cols = np.nonzero(_MOTION)
+    rows, cols = np.nonzero(MOTION)
     index = (36 * joints[:, None] + 6 * rows + cols).ravel()
     return lambda k: np.negative(k.transform.reshape(k.count, -1).take(index, axis=1))
 
 
 def _transposed_transform(joints: IntArray) -> Writer:
-    rows, cols = np.nonzero(_MOTION.T)
+    rows, cols = np.nonzero(MOTION.T)
     index = (36 * joints[:, None] + 6 * cols + rows).ravel()
     return lambda k: k.transform.reshape(k.count, -1).take(index, axis=1)
 

@@ -1,9 +1,10 @@
 """Inequalities in many frames of one pattern: the active set is found by solving with it, on the fast path without constraints.
 
-A row of ``G x <= h`` that is active enters as one more measurement ``G x = h``, so exact that what it leaves (1e-4 of the row's *conditional*
-variance) does not matter; its multiplier is what holds it there, ``z = w^2 (G x - h)``. A row leaves the set when its multiplier turns negative and
-enters when it is violated (the primal-dual active-set method; Hintermueller, Ito and Kunisch 2003). It settles in a few solves where few rows are
-active; a frame in which it does not settle goes to a QP solver. The covariance is that of the estimate while the active set stays what it is.
+A row of ``G x <= h`` that is active enters as one more measurement ``G x = h``, so exact that what it leaves (1e-4 of the row's
+*conditional* variance) does not matter; its multiplier is what holds it there, ``z = w^2 (G x - h)``. A row leaves the set when its
+multiplier turns negative and enters when it is violated (the primal-dual active-set method; Hintermueller, Ito and Kunisch 2003). It
+settles in a few solves where few rows are active; a frame in which it does not settle goes to a QP solver. The covariance is that of the
+estimate while the active set stays what it is.
 """
 
 from __future__ import annotations

@@ -29,8 +29,8 @@ LANES = 8
 MOST_REFINEMENTS = 6
 TOO_WEAK = 1e11
 """Trace of the scaled inverse above which the selected inverse has fewer than about five digits; refined solves come in then."""
-MOST_ENTRIES = 6_000_000
-"""Numbers of A that are held at a time; longer recordings are worked through in pieces."""
+MOST_ENTRIES = 400_000
+"""Numbers of A that are held at a time, so that they stay in the cache; longer recordings are worked through in pieces."""
 
 
 @runtime_checkable
@@ -304,8 +304,8 @@ def solve_frames(
     problem : FrameProblem
         Such as :class:`factorgrasp.problems.human_dynamics.HumanDynamics`.
     solver : str, optional
-        By default "cholesky" by one plan for all frames; with inequalities "active-set", which hands frames that it cannot settle to the best
-        QP solver installed; with equality constraints "kkt" or that QP solver, frame by frame. Any other solver's name also works so.
+        By default "cholesky" by one plan for all frames; with inequalities "active-set", which hands frames that it cannot settle to the
+        best QP solver installed; with equality constraints "kkt" or that QP solver, frame by frame. Any other solver's name also works so.
     options : SolverOptions, optional
         For a solver that goes frame by frame.
     covariance : bool

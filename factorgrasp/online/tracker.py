@@ -40,6 +40,8 @@ _SETTLED_OFFSET = 1e-4
 _SAME_CHANGE, _AFTERMATH = 1.0, 4.0
 # s; before so much data of the grasp after, the detector knows better how far a change went.
 _SETTLING = 0.5
+# s; an estimate from fewer data is nothing to see a change against.
+_BLIND = 1.0
 _MOST_EVENTS = 256
 
 
@@ -214,7 +216,7 @@ class GraspTracker:
             return
         if self.seconds >= self._next_review:
             self._review()
-        if self._watch is not None:
+        if self._watch is not None and self.seconds >= _BLIND:
             self._watch.remember(self.time)
 
     def _review(self) -> None:

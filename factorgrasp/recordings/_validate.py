@@ -123,7 +123,11 @@ def quaternions(value: npt.ArrayLike, field: str, n: int) -> FloatArray:
     norm = np.sqrt(np.einsum("ij,ij->i", array, array))
     off = np.abs(norm - 1.0)
     wrong = off > QUATERNION_NORM_TOLERANCE
-    if wrong.any() and np.nanmax(norm) <= 1.0 + QUATERNION_NORM_TOLERANCE and wrong.mean() <= INTERPOLATED_SHARE:
+    if (
+        wrong.any()
+        and np.nanmax(norm) <= 1.0 + QUATERNION_NORM_TOLERANCE
+        and wrong.mean() <= INTERPOLATED_SHARE
+    ):
         count, short = int(wrong.sum()), float(norm[wrong].min())
         warnings.warn(
             f"{field}: {count} quaternion(s) shorter than 1 (down to {short:.3g}), as interpolation across a change of sign leaves "

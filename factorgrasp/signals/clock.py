@@ -103,7 +103,9 @@ def _averaged(
     rows = x[:, None] if x.ndim == 1 else x
     own = float(np.median(np.diff(t)))
     low = np.searchsorted(t, points - 0.5 * step, side="left")
-    width = int(np.ceil(step / float(np.min(np.diff(t))))) + 1
+    # The most samples that any step has; stamps may jitter.
+    high = np.searchsorted(t, points + 0.5 * step, side="right")
+    width = max(int(np.max(high - low)), 1)
     index = low[:, None] + np.arange(width)
     inside = index < t.size
     index = np.minimum(index, t.size - 1)

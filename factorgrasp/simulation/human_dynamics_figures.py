@@ -1,7 +1,7 @@
 """The figures and tables of the papers on human dynamics, from simulations with known truth, and the page that shows them.
 
-``python -m factorgrasp.simulation.human_dynamics_figures docs`` writes the figures into ``docs/figures`` and the tables into ``docs/human_dynamics.md``;
-``python -m factorgrasp.simulation.human_dynamics_figures docs robustness`` only the first of them.
+``python -m factorgrasp.simulation.human_dynamics_figures docs`` writes the figures into ``docs/figures`` and the tables into
+``docs/human_dynamics.md``; with ``robustness`` behind it only the first of them.
 """
 
 from __future__ import annotations
@@ -315,11 +315,11 @@ def carrying(seed: int = 0) -> Shown:
     rows = []
     made, axes = plots.figure(7.2, 4.0, rows=2)
     for motion in ("standing", "one_foot", "walking"):
-        recording = human_carrying(seed, motion=motion)  # type: ignore[arg-type]
+        recording = human_carrying(seed, motion=motion)
         result, keep = solve_recording(recording, contacts=HANDS, payload=HANDS)
         assert result.payload is not None
         mass, sd = result.payload.mass, result.payload.mass_sd
-        feet = sum(recording.plates[link].force for link in FEET)[keep]
+        feet = np.sum([recording.plates[link].force for link in FEET], axis=0)[keep]
         paper = np.linalg.norm(feet, axis=1) / 9.80665 - recording.body.mass
         for phase in recording.phases:
             during = recording.during(phase)[keep]
@@ -376,7 +376,7 @@ def write_page(folder: Path, names: Sequence[str] = tuple(FIGURES)) -> list[Path
         if not place.search(text):
             raise InputError(str(page), f"a place for {name}: <!-- {name} --> ... <!-- end -->", "none")
         content = shown.markdown()
-        text = place.sub(lambda match, content=content: f"{match[1]}{content}\n{match[2]}", text)
+        text = place.sub(_put(content), text)
         if shown.figure is not None:
             path = folder / "figures" / f"human_dynamics_{name}.svg"
             with replacing(path) as temporary:
@@ -385,6 +385,10 @@ def write_page(folder: Path, names: Sequence[str] = tuple(FIGURES)) -> list[Path
                 )
             written.append(path)
     return [*written, write_text(page, text)]
+
+
+def _put(content: str) -> Callable[[re.Match[str]], str]:
+    return lambda match: f"{match[1]}{content}\n{match[2]}"
 
 
 @plots.styled

@@ -6,6 +6,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from factorgrasp import plots
 from factorgrasp.errors import InputError
 from factorgrasp.human_dynamics_task import HumanDynamicsTask
 from factorgrasp.models.human import human_body
@@ -150,7 +151,23 @@ def test_tpose_efforts_with_a_load_need_the_hand() -> None:
             assert blind < 0.5 * true
 
 
-def test_page_is_renewed_in_its_places(tmp_path: Path) -> None:
+def test_hand_covariances_as_in_the_paper() -> None:
+    shown = figures.hand_covariances()
+    paper, joint, payload = (np.array([float(row[k]) for row in shown.rows]) for k in (1, 2, 3))
+    # Below the covariance of the momentum's rate nothing is found, above it all of it.
+    assert paper[0] < 1.0
+    assert np.abs(paper[2:] - 5.0).max() < 0.3
+    # The plain estimate grows with its prior; with the prior taken out nothing depends on it.
+    assert (np.diff(joint) >= 0.0).all()
+    assert joint[0] < 0.1
+    assert np.ptp(payload) < 0.02
+
+
+def test_page_is_renewed_in_its_places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def small() -> figures.Shown:
+        return figures.Shown(("variance", "kg"), (("1e-04", "0.5"),), plots.figure(2.0, 1.0)[0])
+
+    monkeypatch.setitem(figures.FIGURES, "hand_covariances", small)
     page = tmp_path / figures.PAGE
     page.write_text("before\n<!-- hand_covariances -->\nold\n<!-- end -->\nafter\n", encoding="utf-8")
     written = figures.write_page(tmp_path, ["hand_covariances"])
