@@ -15,7 +15,7 @@ from factorgrasp.problems.grasp_windows import Moments, Windowing
 from factorgrasp.typing import FloatArray
 
 # Stretches of time whose moments are kept apart for the model check. When there are this many, neighbours are merged two by two.
-_MOST_STRETCHES = 14
+_MOST_STRETCHES = 16
 # Forgetting multiplies new weights by a growing factor instead of fading old moments; beyond this exponent everything is scaled back.
 _LARGEST_EXPONENT = 20.0
 

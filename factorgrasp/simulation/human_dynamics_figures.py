@@ -310,6 +310,41 @@ def hand_covariances(seed: int = 0) -> Shown:
     return Shown(header, tuple(rows), made)
 
 
+def feet_covariances(seed: int = 0) -> Shown:
+    """Tirupachuri 2021, figs. 8 and 9: how far the estimated wrenches of the feet are from the measured ones, by their covariance."""
+    recording = human_tpose(seed)
+    motion, keep, own = recording.measured_motion
+    noise = replace(
+        HumanDynamicsNoise.tirupachuri2021(),
+        joint_acceleration=own.joint_acceleration,
+        link_acceleration=own.link_acceleration,
+    )
+    measured = recording.foot_sensors(motion, keep)
+    index = [motion.link(sensor.link) for sensor in measured]
+    rows, curves = [], []
+    for variance, colour in zip((1e-6, 1e-4, 1e-2, 1.0, 1e2), ("ink", "z", "y", "accent", "x"), strict=True):
+        result = HumanDynamicsTask(
+            motion, [replace(s, covariance=variance) for s in measured], noise=noise
+        ).solve()
+        R = motion.R[:, index]
+        force, moment = (
+            np.einsum("nlij,nlj->nli", R, result.frames.external_wrench[:, index, part])
+            for part in (slice(0, 3), slice(3, 6))
+        )
+        values = np.stack([sensor.values for sensor in measured], axis=1)
+        off = [np.linalg.norm(part, axis=2) for part in (force - values[..., :3], moment - values[..., 3:])]
+        rows.append((f"{variance:.0e}", *(f"{np.sqrt(np.mean(part**2)):.3g}" for part in off)))
+        curves.append((f"{variance:.0e}", off[0][:, 0], colour))
+    made, (ax,) = plots.figure(7.2, 2.4)
+    _curves(ax, "Right foot, estimate less measurement, by covariance", "N", recording.t[keep], curves)
+    ax.set_yscale("log")
+    return Shown(
+        ("covariance of the feet (N², (Nm)²)", "force, RMS difference (N)", "moment, RMS difference (Nm)"),
+        tuple(rows),
+        made,
+    )
+
+
 def carrying(seed: int = 0) -> Shown:
     """Tirupachuri 2021, figs. 17 and 18: 9.55 kg in both hands while standing, on one foot and walking."""
     rows = []
@@ -350,6 +385,7 @@ FIGURES: dict[str, Callable[[], Shown]] = {
     "robustness": robustness,
     "sensor_sets": sensor_sets,
     "tpose_efforts": tpose_efforts,
+    "feet_covariances": feet_covariances,
     "hand_covariances": hand_covariances,
     "carrying": carrying,
 }

@@ -151,6 +151,12 @@ def test_tpose_efforts_with_a_load_need_the_hand() -> None:
             assert blind < 0.5 * true
 
 
+def test_feet_are_followed_as_far_as_they_are_trusted() -> None:
+    force = [float(row[1]) for row in figures.feet_covariances().rows]
+    assert force[0] < 1e-2
+    assert (np.diff(force) > 0.0).all()
+
+
 def test_hand_covariances_as_in_the_paper() -> None:
     shown = figures.hand_covariances()
     paper, joint, payload = (np.array([float(row[k]) for row in shown.rows]) for k in (1, 2, 3))
