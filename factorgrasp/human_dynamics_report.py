@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from factorgrasp import plots
-from factorgrasp.human_dynamics_task import HumanDynamicsResult
+from factorgrasp.human_dynamics_result import HumanDynamicsResult
 from factorgrasp.problems.human_dynamics_words import agreement_words
 from factorgrasp.problems.link_motion_spatial import rotate
 from factorgrasp.report import (

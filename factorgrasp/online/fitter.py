@@ -23,6 +23,8 @@ from factorgrasp.typing import FloatArray, IntArray, State
 GRASP_NAMES = ("rotation", "translation")
 # Half-overlapping windows after which a level is used: the short windows at once, the long ones when their slow start no longer costs much.
 _ENOUGH_SHORT, _ENOUGH_LONG = 2.0, 6.0
+# Where gaps leave the long windows less than this part of the data, the short ones know more.
+_COVERED = 0.5
 # A warm start whose step is below this many standard deviations is there.
 _TOLERANCE = 0.5
 # Moments that are definite by so much at a review are taken to stay so until the next.
@@ -64,9 +66,10 @@ class GraspFitter:
     @property
     def level(self) -> Level | None:
         """The windows in use; None while there are too few."""
-        if self.long.bank.count >= _ENOUGH_LONG:
+        short, long = self.short.bank, self.long.bank
+        if long.count >= _ENOUGH_LONG and long.seconds > _COVERED * short.seconds:
             return self.long
-        return self.short if self.short.bank.count >= _ENOUGH_SHORT else None
+        return self.short if short.count >= _ENOUGH_SHORT else None
 
     def solve(self, mean_force: FloatArray, rate_moment: FloatArray) -> Fit | None:
         """The estimate with all windows so far; None while there are too few."""

@@ -10,6 +10,7 @@ import numpy as np
 from factorgrasp.online.moment_solver import Fit, Moment
 from factorgrasp.online.window_bank import WindowBank
 from factorgrasp.problems.grasp_kinematics import RobotNoise
+from factorgrasp.problems.grasp_model import phi_matrix
 from factorgrasp.problems.grasp_noise import (
     BandVariances,
     NoiseMoments,
@@ -60,7 +61,7 @@ class Level:
         self._robot, self._noise, self._settings = robot, noise, settings
         self.expected = self._expect(np.zeros(3), np.zeros((3, 3)))
         self.declared = declared_variances(self.expected, lever_arm)
-        self._lever_arm = lever_arm
+        self._lever_arm = self._guess = lever_arm
         self.variances = self.declared
         self._fresh = True
         self._median = [0.0, 0.0]
@@ -74,8 +75,12 @@ class Level:
         """Expected noise in the weighted sums, for one half-overlapping window."""
         (w_g, w_a), dof = self.variances.weights, self.bank.windowing.dof
         size = float(self._settings.errors_in_variables)
+        # The robot's noise acts on the residual through the lever arm: there cannot be more of it than residual power.
+        phi = phi_matrix(self._lever_arm)
+        through = np.einsum("ij,kjl,il->k", phi, self.expected.accelerometer[:, :12, :12], phi) / 3.0
+        share = np.minimum(1.0, self.variances.accelerometer / np.maximum(through, 1e-300))
         self._noise_g = size * np.tensordot(w_g * dof, self.expected.gyro, 1)
-        self._noise_a = size * np.tensordot(w_a * dof, self.expected.accelerometer, 1)
+        self._noise_a = size * np.tensordot(w_a * dof * share, self.expected.accelerometer, 1)
 
     def moment(self) -> Moment:
         """Weighted sums of all windows."""
@@ -117,8 +122,9 @@ class Level:
     def refresh(self, fit: Fit, mean_force: FloatArray, rate_moment: FloatArray) -> float:
         """Estimate the residual power of every band anew; returns the largest relative change of a variance."""
         self.expected = self._expect(mean_force, rate_moment)
+        self._lever_arm = fit.state["translation"]
         if self._fresh:
-            self.declared = declared_variances(self.expected, self._lever_arm)
+            self.declared = declared_variances(self.expected, self._guess)
         before = self.variances
         self.variances = estimated_variances(
             fit.model,

@@ -140,16 +140,20 @@ class SampleBuffer:
     def _settle(self) -> None:
         if self.step <= 0.0 or self._settled == self._end:
             return
-        before = max(self._settled - 1, self._begin)
-        t = self._t[before : self._end]
-        holes = np.flatnonzero(t[1:] - t[:-1] > _HOLE * self.step)
-        settled = self._end
-        for hole in holes:
-            if self._newest - t[hole] <= self.lateness:
-                settled = before + int(hole) + 1
+        t = self._t[self._settled : self._end]
+        steps = np.empty(t.size)
+        steps[0], steps[1:] = t[0] - self._frontier, t[1:] - t[:-1]
+        count = t.size
+        for hole in np.flatnonzero(steps > _HOLE * self.step):
+            # Nothing was settled before the very first row.
+            before = t[hole] - steps[hole]
+            if np.isfinite(before) and self._newest - before <= self.lateness:
+                count = int(hole)
                 break
-        if settled > self._settled:
-            new = slice(self._settled, settled)
-            self.incomplete += int(np.count_nonzero(np.isnan(self._x[new]).any(axis=1)))
-            self.gaps += int(np.count_nonzero(t[1 : settled - before] - t[: settled - before - 1] > self.limit))
-            self._settled, self._frontier = settled, float(self._t[settled - 1])
+        if count == 0:
+            return
+        new = slice(self._settled, self._settled + count)
+        self.incomplete += int(np.count_nonzero(np.isnan(self._x[new]).any(axis=1)))
+        self.gaps += int(np.count_nonzero((steps[:count] > self.limit) & np.isfinite(steps[:count])))
+        self._settled += count
+        self._frontier = float(t[count - 1])

@@ -36,7 +36,7 @@ _SURE = 20.0
 # A remaining clock offset above this (s) is applied to the data; the model is linear in what remains.
 _SETTLED_OFFSET = 1e-4
 # s; a change that is found this soon after another one is the same one going on, as is a small one (and a drift) a little later. What goes on
-# for longer than the latter is a slip.
+# again and again for longer than the latter is a slip.
 _SAME_CHANGE, _AFTERMATH = 1.0, 4.0
 # s; before so much data of the grasp after, the detector knows better how far a change went.
 _SETTLING = 0.5
@@ -97,6 +97,7 @@ class GraspTracker:
         self._since_hop = self._since_segment = 0
         self._events: deque[GraspEvent] = deque(maxlen=_MOST_EVENTS)
         self._before: tuple[State, FloatArray] | None = None
+        self._repeats = 0
         self.event_count = 0
         self._clock_shift = 0.0
         self._begin()
@@ -253,7 +254,9 @@ class GraspTracker:
         """Put a change on record; one that follows another at once is that one, going on."""
         now, last, jump = self.time, self._events[-1] if self._events else None, change.jump
         if last is not None and self._before is not None and self._goes_on(last, change):
-            drifts = "slip" in (change.kind, last.kind) or now - last.time > _AFTERMATH
+            self._repeats += 1
+            lasts = self._repeats > 1 and now - last.time > _AFTERMATH
+            drifts = lasts or "slip" in (change.kind, last.kind)
             after = retract(self.fitter.model, change.before, _padded(jump.step, self.fitter.model.size))
             self._events[-1] = replace(
                 last,
@@ -267,6 +270,7 @@ class GraspTracker:
         if last is not None:
             self._events[-1] = self._refined(last)
         self._before = (change.before, change.before_covariance[:GRASP, :GRASP])
+        self._repeats = 0
         self.event_count += 1
         self._events.append(
             GraspEvent(change.kind, change.time, now, now, jump.step, jump.covariance, jump.log_bayes_factor)

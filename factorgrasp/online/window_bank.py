@@ -74,6 +74,11 @@ class WindowBank:
         return float(self._total_weight[0]) * self._scale
 
     @property
+    def seconds(self) -> float:
+        """Data that the windows taken stand for, s."""
+        return 0.5 * self.count * self.windowing.length * self.windowing.step
+
+    @property
     def _scale(self) -> float:
         return float(np.exp(-self._exponent))
 

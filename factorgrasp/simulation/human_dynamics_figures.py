@@ -17,7 +17,8 @@ import numpy as np
 
 from factorgrasp import plots
 from factorgrasp.errors import InputError
-from factorgrasp.human_dynamics_task import HumanDynamicsResult, HumanDynamicsTask
+from factorgrasp.human_dynamics_result import HumanDynamicsResult
+from factorgrasp.human_dynamics_task import HumanDynamicsTask
 from factorgrasp.problems.external_wrenches import ExternalWrenches
 from factorgrasp.problems.human_dynamics_sensors import Sensor
 from factorgrasp.problems.human_dynamics_settings import HumanDynamicsNoise
@@ -28,6 +29,7 @@ from factorgrasp.simulation.human_dynamics import (
     human_bowing,
     human_carrying,
     human_tpose,
+    inverse_dynamics,
 )
 from factorgrasp.typing import BoolArray, FloatArray
 
@@ -132,7 +134,7 @@ def robustness(seed: int = 0, torso_mass: float = 6.0) -> Shown:
         ]
         rows.append((joint, f"{np.sqrt(np.mean(truth[:, at] ** 2)):.2f}", *sizes))
     t = with_mass.t[keep]
-    made, axes = plots.figure(7.2, 2.4, columns=2, sharey=True)
+    made, axes = plots.figure(7.2, 2.4, columns=2)
     for ax, k, title in ((axes[0], 0, "Right ankle"), (axes[1], 4, "Right hip")):
         curves = [
             (label, series[label][:, k], colour)
@@ -162,8 +164,6 @@ def _torques(
 
 def _without_feet(recording: HumanRecording, names: Sequence[str]) -> FloatArray:
     """Deterministic inverse dynamics of the model that the estimator knows; the feet get what its own equations of motion ask for."""
-    from factorgrasp.simulation.human_dynamics import inverse_dynamics
-
     torque = inverse_dynamics(recording.body, recording.truth.trajectory)
     return torque[:, [recording.truth.dof_names.index(name) for name in names]]
 
@@ -336,8 +336,9 @@ def feet_covariances(seed: int = 0) -> Shown:
         rows.append((f"{variance:.0e}", *(f"{np.sqrt(np.mean(part**2)):.3g}" for part in off)))
         curves.append((f"{variance:.0e}", off[0][:, 0], colour))
     made, (ax,) = plots.figure(7.2, 2.4)
-    _curves(ax, "Right foot, estimate less measurement, by covariance", "N", recording.t[keep], curves)
-    ax.set_yscale("log")
+    _curves(
+        ax, "Right foot, estimate less measurement, by covariance", "N", recording.t[keep], curves, log=True
+    )
     return Shown(
         ("covariance of the feet (N², (Nm)²)", "force, RMS difference (N)", "moment, RMS difference (Nm)"),
         tuple(rows),
@@ -447,14 +448,23 @@ def _bars(ax: Axes, groups: Sequence[str], names: Sequence[str], heights: FloatA
 
 @plots.styled
 def _curves(
-    ax: Axes, title: str, unit: str, t: FloatArray, curves: Sequence[tuple[str, FloatArray, str]]
+    ax: Axes,
+    title: str,
+    unit: str,
+    t: FloatArray,
+    curves: Sequence[tuple[str, FloatArray, str]],
+    log: bool = False,
 ) -> None:
     for label, values, colour in curves:
         ax.plot(t, values, color=plots.PALETTE[colour], label=label, linewidth=1.0)
     ax.set_title(title)
     ax.set_ylabel(unit)
     ax.set_xlabel("time (s)")
-    ax.margins(y=0.12)
+    if log:
+        ax.set_yscale("log")
+    low, high = ax.get_ylim()
+    # Room for the legend, which must not cover a curve.
+    ax.set_ylim(low, high * (high / low) ** 0.3 if log else high + 0.3 * (high - low))
     ax.legend(
         ncols=2 if len(curves) < 4 else 3,
         loc="upper right",
