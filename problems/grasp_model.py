@@ -165,8 +165,8 @@ class GraspModel:
             J_a[rows, :, 18] = dM @ b_a
 
         turned = R @ _SKEW
-        gyro_gain(where["rotation"], turned @ (R.T @ M_g))
-        accelerometer_gain(where["rotation"], turned @ (R.T @ M_a))
+        gyro_gain(where["rotation"], turned if M_g is R else turned @ (R.T @ M_g))
+        accelerometer_gain(where["rotation"], turned if M_a is R else turned @ (R.T @ M_a))
         J_a[where["translation"], :, :12] = _PHI_JACOBIAN
         if "gyro_bias" in where:
             J_g[where["gyro_bias"], :, 9] = M_g.T

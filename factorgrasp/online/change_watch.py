@@ -7,7 +7,16 @@ import numpy as np
 from factorgrasp.online.change import Change, DetectorSettings
 from factorgrasp.online.coupled_rows import ACCELEROMETER, GYRO, shift_hand
 from factorgrasp.online.fitter import GraspFitter, columns_of
-from factorgrasp.online.jump_detector import GRASP, GUARD, REACH, STARTS, Jump, JumpDetector, Segments, explain
+from factorgrasp.online.jump_detector import (
+    GRASP,
+    GUARD,
+    REACH,
+    STARTS,
+    Jump,
+    JumpDetector,
+    Segments,
+    explain,
+)
 from factorgrasp.online.moment_solver import Linearised, Moment, local, retract
 from factorgrasp.online.row_history import RowHistory
 from factorgrasp.online.slow_watch import SlowWatch
@@ -18,8 +27,8 @@ from factorgrasp.typing import FloatArray, State
 _SLIP_EVIDENCE = 3.0
 _SLIP_SHARE = 0.05
 _SHORTEST_SLIP = 20
-# Starts are all tried at every fourth segment, the newest ones whenever a segment fits badly.
-_FULL_TEST, _QUICK_STARTS = 4, 4
+# Starts are all tried at every sixth segment, the newest ones whenever a segment fits badly.
+_FULL_TEST, _QUICK_STARTS = 6, 4
 # Segments of a second, roughly.
 _SECOND = 25
 # A reference this far (tangent step) from the estimate before makes its snapshots worthless.
@@ -205,7 +214,9 @@ class ChangeWatch:
             return
         assert self._lines is not None
         normals = self._lines.normals(self._segment_moments(count), self._fitter.short.window_noise)
-        self._detector.add_segments(self._coefficients.last_times(count), *normals, self._fitter.short.residuals)
+        self._detector.add_segments(
+            self._coefficients.last_times(count), *normals, self._fitter.short.residuals
+        )
 
     def _before(self, jump: Jump) -> tuple[float, State, FloatArray]:
         assert self._reference is not None
@@ -218,10 +229,16 @@ class ChangeWatch:
         first = (jump.segments + GUARD + 2) * self._segment
         z = rows.last(min(first, rows.kept))
         gain = np.zeros(z.shape[0])
-        for part, L_before, L_after in zip((GYRO, ACCELEROMETER), self._model.matrices(before), self._model.matrices(after), strict=True):
+        for part, L_before, L_after in zip(
+            (GYRO, ACCELEROMETER), self._model.matrices(before), self._model.matrices(after), strict=True
+        ):
             e_before = np.sum((z[:, part] @ L_before.T) ** 2, axis=1)
             e_after = np.sum((z[:, part] @ L_after.T) ** 2, axis=1)
             gain += (e_before - e_after) / max(float(np.mean(e_before[: self._segment])), 1e-300)
         # The best split: rows after it speak for the new grasp, rows before it for the old one.
         total = np.cumsum(gain[::-1])
-        return int(np.clip(np.argmax(total) + 1, jump.segments * self._segment, (jump.segments + GUARD) * self._segment))
+        return int(
+            np.clip(
+                np.argmax(total) + 1, jump.segments * self._segment, (jump.segments + GUARD) * self._segment
+            )
+        )

@@ -7,17 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from factorgrasp.online.coupled_rows import Coupler, HandReader
-from factorgrasp.online.robot_feed import Differentiator, ImuRows, MotionRows, PoseRows, RobotFeed, RobotKind
-from factorgrasp.online.sample_buffer import SampleBuffer
-from factorgrasp.online.stream_pieces import GapCutter
+from factorgrasp.online.robot_feed import RobotKind
 from factorgrasp.problems.grasp_averaging import averaged_samples
 from factorgrasp.problems.grasp_kinematics import RobotNoise, differentiator, gap_limit, robot_kinematics
 from factorgrasp.problems.grasp_recording import (
     ClockSearch,
     HandSignals,
     find_clock,
-    tilt_axes,
 )
 from factorgrasp.problems.grasp_settings import GraspNoise, GraspSettings
 from factorgrasp.recordings import ImuStream, MotionStream, PoseStream
@@ -70,10 +66,14 @@ class Setup:
         Samples of the robot's differentiation.
     finer_step : float or None
         s; see :class:`factorgrasp.online.robot_feed.RobotFeed`.
+    averaged_poses : int
+        Poses whose mean is differentiated.
     master_step : float
-        s, of the grid on which both sides meet.
+        s, between the robot's rows when the hand joins them.
     averaged : int
-        Samples that one row of z averages.
+        Such rows that one row of z averages.
+    averaged_hand : int
+        Readings of the hand within one such row.
     step : float
         s, between rows of z.
     noise : callable
@@ -86,8 +86,10 @@ class Setup:
     bandwidth: float
     window: int
     finer_step: float | None
+    averaged_poses: int
     master_step: float
     averaged: int
+    averaged_hand: int
     step: float
     noise: Callable[[FloatArray], RobotNoise]
 
@@ -116,34 +118,36 @@ def analyse(
     t, x = hand
     signals = HandSignals.from_stream(ImuStream(t, x[:, :3], x[:, 3:]), settings.max_gap)
     clock = find_clock(motion, signals, settings, bandwidth)
-    finer = timings[1].step if rates[1] > 1.05 * rates[0] else None
-    master = finer or timings[0].step
-    averaged = averaged_samples(master, bandwidth)
+    robot_step, hand_step = timings[0].step, timings[1].step
+    averaged_poses = motion.averaged
     window = 1
     if kind != "motion":
-        window = differentiator(kinematics_bandwidth, timings[0].step, t.size, "robot stream")[0]
-    return Setup(
-        timings[0], timings[1], clock, bandwidth, window, finer, master, averaged, averaged * master, motion.noise
-    )
-
-
-def feed(setup: Setup, kind: RobotKind, gravity: FloatArray, tilted: bool) -> RobotFeed:
-    """The robot's side from its first sample on."""
-    tilt = tilt_axes(gravity) if tilted else None
-    step = setup.robot.step
-    rows: Differentiator
-    if kind == "poses":
-        rows = PoseRows(setup.window, step, gravity, tilt)
-    elif kind == "imu":
-        rows = ImuRows(setup.window, step)
+        window = differentiator(
+            kinematics_bandwidth, robot_step * averaged_poses, motion.t.size, "robot stream"
+        )[0]
+    finer, averaged, averaged_hand = None, 1, 1
+    master = robot_step * averaged_poses
+    if averaged_poses > 1:
+        # The robot's rows are means over their step already; the hand's are averaged over the same.
+        averaged_hand = max(averaged_poses, round(master / hand_step))
     else:
-        rows = MotionRows(tilt)
-    return RobotFeed(GapCutter(setup.robot.limit), rows, step, setup.robot.regular, setup.finer_step, kind == "poses")
-
-
-def coupler(setup: Setup, hand: SampleBuffer, tilted: bool, keep: float) -> Coupler:
-    """Both sides together."""
-    return Coupler(HandReader(hand), setup.averaged, setup.step, tilted, keep)
+        finer = hand_step if robot_step > 1.05 * hand_step else None
+        master = finer or robot_step
+        averaged = averaged_samples(master, bandwidth)
+    return Setup(
+        robot=timings[0],
+        hand=timings[1],
+        clock=clock,
+        bandwidth=bandwidth,
+        window=window,
+        finer_step=finer,
+        averaged_poses=averaged_poses,
+        master_step=master,
+        averaged=averaged,
+        averaged_hand=averaged_hand,
+        step=averaged * master,
+        noise=motion.noise,
+    )
 
 
 def _stream(kind: RobotKind, t: FloatArray, x: FloatArray) -> PoseStream | MotionStream | ImuStream:
@@ -160,4 +164,3 @@ def enough(t: FloatArray, x: FloatArray, seconds: float) -> bool:
     if t.size < 32 or t[-1] - t[0] < seconds:
         return False
     return bool(np.mean(np.isfinite(x).all(axis=1)) > 0.5)
-

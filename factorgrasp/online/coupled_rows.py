@@ -60,7 +60,11 @@ class HandReader:
         if t.size < 4:
             return np.full((times.size, 6), np.nan)
         step = self._buffer.step
-        if times.size > 1 and np.all(np.abs(t[1:] - t[:-1] - step) < _UNIFORM * step) and np.isfinite(x).all():
+        if (
+            times.size > 1
+            and np.all(np.abs(t[1:] - t[:-1] - step) < _UNIFORM * step)
+            and np.isfinite(x).all()
+        ):
             slope = (t[-1] - t[0]) / (t.size - 1)
             first, last = (times[0] - t[0]) / slope, (times[-1] - t[0]) / slope
             if abs((last - first) - (times.size - 1)) < _UNIFORM:
@@ -83,7 +87,9 @@ class Coupler:
     ----------
     hand : HandReader
     averaged : int
-        Samples whose mean is one row.
+        Rows of the robot whose mean is one row.
+    averaged_hand : int
+        Readings of the hand whose mean joins one row of the robot.
     step : float
         s, between rows.
     tilted : bool
@@ -91,8 +97,12 @@ class Coupler:
         s; the robot's rows wait no longer than this for the hand.
     """
 
-    def __init__(self, hand: HandReader, averaged: int, step: float, tilted: bool, keep: float) -> None:
+    def __init__(
+        self, hand: HandReader, averaged: int, averaged_hand: int, step: float, tilted: bool, keep: float
+    ) -> None:
         self._hand, self._averaged, self._step, self._keep = hand, averaged, step, keep
+        self._averaged_hand = averaged_hand
+        self._inside = ((np.arange(averaged_hand) + 0.5) / averaged_hand - 0.5) * step / averaged
         self._width = row_width(tilted)
         self._queue: deque[Piece] = deque()
         self.overflown = 0
@@ -105,7 +115,9 @@ class Coupler:
             if self._queue and not piece.starts:
                 # One piece is read and averaged faster than two.
                 last = self._queue.pop()
-                piece = Piece(np.concatenate([last.t, piece.t]), np.concatenate([last.x, piece.x]), last.starts)
+                piece = Piece(
+                    np.concatenate([last.t, piece.t]), np.concatenate([last.x, piece.x]), last.starts
+                )
             self._queue.append(piece)
         while len(self._queue) > 1 and self._queue[-1].t[-1] - self._queue[0].t[-1] > self._keep:
             self.overflown += self._queue.popleft().t.size
@@ -113,7 +125,7 @@ class Coupler:
 
     def pull(self, offset: float) -> list[Piece]:
         """Rows of z, with the hand read at ``t + offset``: all that both clocks allow."""
-        ready = self._hand.ready - offset
+        ready = self._ready(offset)
         out: list[Piece] = []
         while self._queue and self._queue[0].t[0] <= ready:
             piece = self._queue.popleft()
@@ -123,15 +135,25 @@ class Coupler:
                 piece = Piece(piece.t[:count], piece.x[:count], piece.starts)
             if piece.starts:
                 self._break()
-            out += self._couple(piece.t, piece.x, self._hand.at(piece.t + offset))
+            out += self._couple(piece.t, piece.x, self._read(piece.t + offset))
             self._done = float(piece.t[-1])
         return out
+
+    def _ready(self, offset: float) -> float:
+        """Rows of the robot up to this time (s) can be joined."""
+        return self._hand.ready - offset - float(self._inside[-1])
+
+    def _read(self, times: FloatArray) -> FloatArray:
+        """The hand (m, 6) at times (m,) of its clock, averaged as the robot is."""
+        if self._averaged_hand == 1:
+            return self._hand.at(times)
+        return average(self._hand.at((times[:, None] + self._inside).ravel()), self._averaged_hand)
 
     def available(self, offset: float) -> float:
         """Time (s) that could be pulled now."""
         if not self._queue:
             return 0.0
-        return min(self._hand.ready - offset, float(self._queue[-1].t[-1])) - float(self._queue[0].t[0])
+        return min(self._ready(offset), float(self._queue[-1].t[-1])) - float(self._queue[0].t[0])
 
     def release(self, offset: float) -> None:
         """Let the hand's samples go that no later row needs."""
@@ -174,13 +196,25 @@ class Coupler:
     def _row(self, x: FloatArray) -> FloatArray:
         inner, slope = x[1:-1], (x[2:, -6:] - x[:-2, -6:]) / (2.0 * self._step)
         z = np.empty((inner.shape[0], self._width))
-        z[:, 0:3], z[:, _HAND_RATE], z[:, _RATE_SLOPE], z[:, 9] = inner[:, 0:3], inner[:, -6:-3], slope[:, :3], 1.0
-        z[:, 10:22], z[:, _HAND_FORCE], z[:, _FORCE_SLOPE], z[:, 28] = inner[:, 3:15], inner[:, -3:], slope[:, 3:], 1.0
+        z[:, 0:3], z[:, _HAND_RATE], z[:, _RATE_SLOPE], z[:, 9] = (
+            inner[:, 0:3],
+            inner[:, -6:-3],
+            slope[:, :3],
+            1.0,
+        )
+        z[:, 10:22], z[:, _HAND_FORCE], z[:, _FORCE_SLOPE], z[:, 28] = (
+            inner[:, 3:15],
+            inner[:, -3:],
+            slope[:, 3:],
+            1.0,
+        )
         z[:, 29:] = inner[:, ROBOT_WIDTH:-6]
         return z
 
 
-def _joined(before: tuple[FloatArray, FloatArray], t: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _joined(
+    before: tuple[FloatArray, FloatArray], t: FloatArray, x: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     if before[0].size == 0:
         return t, x
     return np.concatenate([before[0], t]), np.concatenate([before[1], x])

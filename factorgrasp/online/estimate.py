@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -11,10 +11,9 @@ from factorgrasp import lie
 from factorgrasp.observability import Observability, default_words, observe
 from factorgrasp.online.events import GraspEvent
 from factorgrasp.problems import grasp_words
-from factorgrasp.problems.grasp_model import GraspModel
 from factorgrasp.status import Status
 from factorgrasp.typing import FloatArray, State
-from factorgrasp.variables import Variable
+from factorgrasp.variables import Variable, slices
 
 
 @dataclass(frozen=True)
@@ -31,7 +30,7 @@ class StreamCounts:
     incomplete : int
         Rows with a NaN: gaps.
     gaps : int
-        Missing stretches, whose neighbours were not bridged.
+        Stretches without stamps; nothing was put in their place.
     overflown : int
         Waited for the other stream until there was no room.
     """
@@ -65,14 +64,19 @@ class OnlineGraspEstimate:
     covariance : (6, 6) ndarray
         Order [rotation; translation]; rotation as right perturbation of ``R_r_h``, rad and m.
     time_offset, time_offset_sd : float
-        s, hand clock minus robot clock.
-    gyro_bias, gyro_bias_sd, accelerometer_bias, accelerometer_bias_sd : (3,) ndarray
-        rad/s and m/s^2, in the hand's sensor frame.
+        s, hand clock minus robot clock; sd 0 when it was given.
     seconds : float
         Data of the present grasp, s.
     events : tuple of GraspEvent
         Regrasps and slips so far (the newest 256).
     robot, hand : StreamCounts
+    variables : tuple of Variable
+        All unknowns, in the order of `full_covariance`; empty before the first solve.
+    values : mapping
+        Their values by name; the time offset is what remains beyond the one already applied.
+    full_covariance : (n, n) ndarray
+    rate_moment : (3, 3) ndarray
+        Mean of ``w_r w_r'`` over the present grasp, (rad/s)^2.
     """
 
     t: float
@@ -83,18 +87,14 @@ class OnlineGraspEstimate:
     covariance: FloatArray
     time_offset: float
     time_offset_sd: float
-    gyro_bias: FloatArray
-    gyro_bias_sd: FloatArray
-    accelerometer_bias: FloatArray
-    accelerometer_bias_sd: FloatArray
     seconds: float
     events: tuple[GraspEvent, ...]
     robot: StreamCounts
     hand: StreamCounts
-    _model: GraspModel | None = field(default=None, repr=False)
-    _state: State | None = field(default=None, repr=False)
-    _full: FloatArray | None = field(default=None, repr=False)
-    _rate_moment: FloatArray | None = field(default=None, repr=False)
+    variables: tuple[Variable, ...]
+    values: State
+    full_covariance: FloatArray
+    rate_moment: FloatArray
 
     @property
     def rotation_wxyz(self) -> FloatArray:
@@ -109,21 +109,31 @@ class OnlineGraspEstimate:
         return out
 
     @property
-    def state(self) -> State:
-        """All unknowns by name, sensor errors included; empty before the first solve."""
-        return dict(self._state or {})
+    def gyro_bias(self) -> FloatArray:
+        """Gyroscope bias (3,), rad/s, hand's sensor frame; zero when it is not estimated."""
+        return self._value("gyro_bias")
 
     @property
-    def full_covariance(self) -> FloatArray:
-        """Covariance (n, n) of all unknowns, in the order of `state`."""
-        return np.zeros((0, 0)) if self._full is None else self._full
+    def gyro_bias_sd(self) -> FloatArray:
+        """Its standard deviation (3,), rad/s."""
+        return self._sd("gyro_bias")
+
+    @property
+    def accelerometer_bias(self) -> FloatArray:
+        """Accelerometer bias (3,), m/s^2, hand's sensor frame; zero when it is not estimated."""
+        return self._value("accelerometer_bias")
+
+    @property
+    def accelerometer_bias_sd(self) -> FloatArray:
+        """Its standard deviation (3,), m/s^2."""
+        return self._sd("accelerometer_bias")
 
     @cached_property
     def observability(self) -> Observability | None:
         """Directions of the grasp that the motion showed or did not show; None before the first solve."""
-        if self._model is None or self._full is None or self._rate_moment is None:
+        if not self.variables:
             return None
-        full, where, rates = self._full, self._model.columns, self._rate_moment
+        where, rates = slices(self.variables), self.rate_moment
 
         def describe(variable: Variable, vector: FloatArray) -> str:
             if variable.name in ("rotation", "translation"):
@@ -131,8 +141,8 @@ class OnlineGraspEstimate:
             return default_words(variable, vector)
 
         return observe(
-            self._model.variables,
-            lambda name: full[where[name], where[name]],
+            self.variables,
+            lambda name: self.full_covariance[where[name], where[name]],
             describe,
             grasp_words.advice(rates, None),
         )
@@ -145,12 +155,13 @@ class OnlineGraspEstimate:
     def summary(self) -> str:
         """A few lines for a terminal."""
         lines = [f"grasp pose at {self.t:.2f} s: {self.status.value}"]
-        if self._state is not None:
+        if self.variables:
             sd = np.sqrt(np.diag(self.covariance))
             w, x, y, z = self.rotation_wxyz
+            turn_sd, way_sd = _triple(np.degrees(sd[:3]), 4), _triple(1e3 * sd[3:], 2)
             lines += [
-                f"  rotation R_r_h [w x y z]   {w:.6f} {x:.6f} {y:.6f} {z:.6f}   sd {_triple(np.degrees(sd[:3]), 4)} deg",
-                f"  translation p_r_h          {_triple(1e3 * self.translation, 2)} mm   sd {_triple(1e3 * sd[3:], 2)} mm",
+                f"  rotation R_r_h [w x y z]   {w:.6f} {x:.6f} {y:.6f} {z:.6f}   sd {turn_sd} deg",
+                f"  translation p_r_h          {_triple(1e3 * self.translation, 2)} mm   sd {way_sd} mm",
                 f"  time offset hand - robot   {1e3 * self.time_offset:.3f} ms   sd {1e3 * self.time_offset_sd:.3f} ms",
                 f"  gyroscope bias             {_triple(self.gyro_bias, 5)} rad/s",
                 f"  accelerometer bias         {_triple(self.accelerometer_bias, 4)} m/s^2",
@@ -159,6 +170,16 @@ class OnlineGraspEstimate:
         if self.message:
             lines.append(f"  {self.message}")
         return "\n".join(lines)
+
+    def _value(self, name: str) -> FloatArray:
+        unknown = np.zeros(3) if self.variables else np.full(3, np.nan)
+        return np.asarray(self.values.get(name, unknown))
+
+    def _sd(self, name: str) -> FloatArray:
+        if name not in self.values:
+            return np.zeros(3) if self.variables else np.full(3, np.inf)
+        where = slices(self.variables)[name]
+        return np.asarray(np.sqrt(np.diag(self.full_covariance)[where]))
 
 
 def _triple(values: FloatArray, digits: int) -> str:

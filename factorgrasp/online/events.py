@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -24,8 +25,8 @@ class GraspEvent:
     until : float
         When it was seen to go on for the last time, s; `detected` if only once.
     step : (6,) ndarray
-        How far, [rotation vector; translation]: ``log(R_before' R_after)`` (rad, hand frame before) and ``p_after - p_before`` (m, end-effector
-        frame). Refined while data of the grasp after come in, until the next event.
+        How far, [rotation vector; translation]: ``log(R_before' R_after)`` (rad, hand frame before) and ``p_after - p_before`` (m,
+        end-effector frame). Refined while data of the grasp after come in, until the next event.
     covariance : (6, 6) ndarray
         Of `step`.
     log_bayes_factor : float
@@ -72,9 +73,10 @@ class GraspEvent:
 
     def __str__(self) -> str:
         span = f"{self.time:.2f} s" if self.kind == "regrasp" else f"{self.time:.2f} to {self.until:.2f} s"
+        angle, angle_sd = math.degrees(self.angle), math.degrees(self.angle_sd)
         return (
-            f"{self.kind} at {span}: {np.degrees(self.angle):.2f} deg (sd {np.degrees(self.angle_sd):.2f}), "
-            f"{1e3 * self.distance:.1f} mm (sd {1e3 * self.distance_sd:.1f}), log Bayes factor {self.log_bayes_factor:.0f}"
+            f"{self.kind} at {span}: {angle:.2f} deg (sd {angle_sd:.2f}), {1e3 * self.distance:.1f} mm "
+            f"(sd {1e3 * self.distance_sd:.1f}), log Bayes factor {self.log_bayes_factor:.0f}"
         )
 
 
@@ -83,4 +85,4 @@ def _norm_sd(vector: FloatArray, covariance: FloatArray) -> float:
     if size == 0.0:
         return float(np.sqrt(np.trace(covariance) / 3.0))
     along = vector / size
-    return float(np.sqrt(max(along @ covariance @ along, 0.0)))
+    return math.sqrt(max(float(along @ covariance @ along), 0.0))

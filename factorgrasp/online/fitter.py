@@ -30,7 +30,9 @@ _TOLERANCE = 0.5
 # Moments that are definite by so much at a review are taken to stay so until the next.
 _MARGIN = 1e-9
 # Half a turn from the present rotation lie the other local optima, if any. They are tried while data are few.
-_HALF_TURNS = np.array([np.diag(signs) for signs in ((1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, 1.0))])
+_HALF_TURNS = np.array(
+    [np.diag(signs) for signs in ((1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, 1.0))]
+)
 # A start that ends lower by this much of the cost (a log likelihood) is better.
 _BETTER = 1.0
 
@@ -51,12 +53,16 @@ class GraspFitter:
     noise, settings, prior : GraspNoise, GraspSettings, GraspPrior
     """
 
-    def __init__(self, short: Level, long: Level, noise: GraspNoise, settings: GraspSettings, prior: GraspPrior) -> None:
+    def __init__(
+        self, short: Level, long: Level, noise: GraspNoise, settings: GraspSettings, prior: GraspPrior
+    ) -> None:
         self.short, self.long = short, long
         self._noise, self._settings, self._grasp_prior = noise, settings, prior
         absent = frozenset() if settings.sensor_errors == "always" else frozenset(SENSOR_ERRORS)
         self.model = GraspModel(*grasp_variables(noise, settings, absent))
-        self.prior = GaussianPrior(self._prior_mean(self.model), np.diag(prior_precision(self.model, noise, prior)))
+        self.prior = GaussianPrior(
+            self._prior_mean(self.model), np.diag(prior_precision(self.model, noise, prior))
+        )
         self.fit: Fit | None = None
         self._check: ModelCheck | None = None
         self._covariance: tuple[Fit, FloatArray] | None = None
@@ -148,7 +154,10 @@ class GraspFitter:
     def _first(self, level: Level, mean_force: FloatArray, rate_moment: FloatArray) -> Fit:
         start = self._guess
         if start is None:
-            start = {**self.prior.mean, "rotation": wahba_start(level.moment().gyro[:3, 3:6], self._grasp_prior)}
+            start = {
+                **self.prior.mean,
+                "rotation": wahba_start(level.moment().gyro[:3, 3:6], self._grasp_prior),
+            }
         for _ in range(5):
             self.fit = descend(self.model, start, level.moment(), self.prior, 20)
             start = self.fit.state

@@ -9,12 +9,12 @@ import numpy.typing as npt
 
 from factorgrasp.errors import InputError
 from factorgrasp.online.change import DetectorSettings
-from factorgrasp.online.clock_start import Setup, analyse, coupler, enough, feed
-from factorgrasp.online.coupled_rows import Coupler
+from factorgrasp.online.clock_start import analyse, enough
 from factorgrasp.online.estimate import OnlineGraspEstimate, StreamCounts
 from factorgrasp.online.events import GraspEvent
-from factorgrasp.online.robot_feed import COLUMNS, RobotFeed, RobotKind
+from factorgrasp.online.robot_feed import COLUMNS, RobotKind
 from factorgrasp.online.sample_buffer import SampleBuffer
+from factorgrasp.online.session import GraspSession
 from factorgrasp.online.tracker import GraspTracker
 from factorgrasp.problems import grasp_words
 from factorgrasp.problems.grasp_pose import checked_gravity
@@ -23,24 +23,23 @@ from factorgrasp.problems.grasp_settings import GraspNoise, GraspPrior, GraspSet
 from factorgrasp.status import Status
 from factorgrasp.typing import FloatArray
 
-# s; the first seconds are looked at again after this much more data while they do not show the clocks' offset.
-_RETRY = 0.5
+# s; while the first seconds do not show the clocks' offset they are looked at again, less and less often.
+_RETRY, _LONGEST_RETRY = 0.5, 2.0
 # s; the offset found in the first seconds is applied and they are read again until it moves by less than this.
 _SETTLED_START = 2e-4
 _MOST_PASSES = 4
 # s; the offset must be known this well from the first seconds, or more of them are awaited.
 _STARTING_OFFSET_SD = 3e-3
-# Chunks that are a block long but for rounding.
-_ALMOST = 0.9
 # A quaternion shorter than 1 by more than this was interpolated across a change of sign: a gap. A longer one is something else.
 _QUATERNION_TOLERANCE = 1e-2
+_DEFAULT_DETECTOR = DetectorSettings()
 
 
 class OnlineGraspPose:
     """Estimates the grasp pose while robot and hand move, from samples as they come.
 
-    Feed both sides with :meth:`add_robot` and :meth:`add_hand`, sample by sample or in chunks, each on its own clock; ask :meth:`estimate` whenever it
-    is wanted. Rates up to some kHz; memory does not grow.
+    Feed both sides with :meth:`add_robot` and :meth:`add_hand`, sample by sample or in chunks, each on its own clock; ask
+    :meth:`estimate` whenever it is wanted. Rates up to some kHz; memory does not grow.
 
     Parameters
     ----------
@@ -51,8 +50,8 @@ class OnlineGraspPose:
         In the robot's world frame, m/s^2.
     prior : GraspPrior
     lateness : float
-        s; samples may come late, and out of order, by this much against the newest of their own stream. Where a stamp is missing the rows
-        behind it wait this long; what comes later still is dropped and counted.
+        s; samples may come late, and out of order, by this much against the newest of their own stream. Where a stamp is missing the
+        rows behind it wait this long; what comes later still is dropped and counted.
     detector : DetectorSettings or None
         When a regrasp or a slip is reported; None: never looked for.
     start_seconds : float
@@ -65,12 +64,13 @@ class OnlineGraspPose:
     Raises
     ------
     InputError
-        On bad arguments; and from :meth:`add_robot` or :meth:`add_hand` on samples of the wrong shape, or with units that cannot be right.
+        On bad arguments; and from :meth:`add_robot` or :meth:`add_hand` on samples of the wrong shape, or with units that cannot be
+        right.
 
     Notes
     -----
-    Lag of the newest data: two hand samples, one block, two rows of z (10 ms), and for poses half the differentiation window (about 20 ms at 40 Hz).
-    Newest data count fully only after half an analysis window (0.5 s); the change detector sees them within 0.1 s.
+    Lag of the newest data: two hand samples, one block, two rows of z (10 ms), and for poses half the differentiation window (about
+    20 ms at 40 Hz). Newest data count fully only after half an analysis window (0.5 s); the change detector sees them within 0.1 s.
     """
 
     def __init__(
@@ -81,36 +81,39 @@ class OnlineGraspPose:
         prior: GraspPrior | None = None,
         *,
         lateness: float = 0.2,
-        detector: DetectorSettings | None = DetectorSettings(),
+        detector: DetectorSettings | None = _DEFAULT_DETECTOR,
         start_seconds: float = 3.0,
         buffer_seconds: float = 10.0,
         block: float = 0.02,
     ) -> None:
         self.noise, self.settings = noise or GraspNoise(), settings or GraspSettings()
         self.prior, self.gravity = prior or GraspPrior(), checked_gravity(gravity)
-        for name, value in (("start_seconds", start_seconds), ("buffer_seconds", buffer_seconds), ("block", block)):
+        for name, value in (("start_seconds", start_seconds), ("block", block)):
             if not (np.isfinite(value) and value > 0.0):
                 raise InputError(name, "a finite number of seconds above zero", repr(value))
         if not (np.isfinite(lateness) and lateness >= 0.0):
             raise InputError("lateness", "a finite number of seconds, zero or more", repr(lateness))
-        ahead = self.settings.max_time_offset + abs(self.settings.time_offset_guess)
-        if buffer_seconds < start_seconds + ahead + lateness:
+        least = (
+            start_seconds + self.settings.max_time_offset + abs(self.settings.time_offset_guess) + lateness
+        )
+        if not (np.isfinite(buffer_seconds) and buffer_seconds >= least):
             raise InputError(
                 "buffer_seconds",
-                f"at least start_seconds + max_time_offset + |time_offset_guess| + lateness = {start_seconds + ahead + lateness:g} s",
+                f"at least {least:g} s: start_seconds + max_time_offset + |time_offset_guess| + lateness",
                 repr(buffer_seconds),
             )
-        self._lateness, self._keep, self._start_seconds, self._block = lateness, buffer_seconds, start_seconds, block
+        self._lateness, self._keep, self._start_seconds, self._block = (
+            lateness,
+            buffer_seconds,
+            start_seconds,
+            block,
+        )
         self._detector = detector
         self._kind: RobotKind | None = None
         self._robot: SampleBuffer | None = None
         self._hand = SampleBuffer(6, lateness, buffer_seconds)
-        self._next_try = -np.inf
-        self._setup: Setup | None = None
-        self._feed: RobotFeed | None = None
-        self._coupler: Coupler | None = None
-        self._tracker: GraspTracker | None = None
-        self._offset = 0.0
+        self._session: GraspSession | None = None
+        self._next_try, self._retry = -np.inf, _RETRY
         self._correlation = 0.0
 
     # ---- samples in --------------------------------------------------------------------------------------
@@ -134,8 +137,8 @@ class OnlineGraspPose:
         position, rotation_wxyz : (3,) or (m, 3); (4,) or (m, 4) array_like
             Poses: ``p_w_r`` (m) and ``R_w_r`` as unit quaternion [w, x, y, z].
         angular_velocity, angular_acceleration, specific_force : (3,) or (m, 3) array_like
-            Motion in the end-effector frame (rad/s, rad/s^2, m/s^2); without the acceleration, an IMU that defines that frame. `rotation_wxyz` with
-            motion is used for the base tilt only.
+            Motion in the end-effector frame (rad/s, rad/s^2, m/s^2); without the acceleration, an IMU that defines that frame.
+            `rotation_wxyz` with motion is used for the base tilt only.
         """
         if angular_velocity is None:
             kind: RobotKind = "poses"
@@ -150,7 +153,9 @@ class OnlineGraspPose:
                 parts.append(("rotation_wxyz", rotation_wxyz, 4))
         if self._kind is None:
             if kind == "imu" and self.settings.base_tilt:
-                raise InputError("settings.base_tilt", "a robot stream with orientations", "an IMU on the robot")
+                raise InputError(
+                    "settings.base_tilt", "a robot stream with orientations", "an IMU on the robot"
+                )
             self._kind = kind
             extra = 4 if kind == "motion" and self.settings.base_tilt else 0
             self._robot = SampleBuffer(COLUMNS[kind] + extra, self._lateness, self._keep)
@@ -164,7 +169,9 @@ class OnlineGraspPose:
         self._robot.add(stamps, np.hstack(rows))
         self._advance()
 
-    def add_hand(self, t: npt.ArrayLike, angular_velocity: npt.ArrayLike, specific_force: npt.ArrayLike) -> None:
+    def add_hand(
+        self, t: npt.ArrayLike, angular_velocity: npt.ArrayLike, specific_force: npt.ArrayLike
+    ) -> None:
         """Take one sample of the IMU on the hand or a chunk of them.
 
         Parameters
@@ -185,157 +192,130 @@ class OnlineGraspPose:
     @property
     def events(self) -> tuple[GraspEvent, ...]:
         """Regrasps and slips so far, oldest first."""
-        return () if self._tracker is None else self._tracker.events
+        return () if self._session is None else self._session.tracker.events
 
     @property
     def started(self) -> bool:
         """Whether the first seconds have shown rates and clocks, so that estimates come."""
-        return self._tracker is not None
+        return self._session is not None
 
     def estimate(self) -> OnlineGraspEstimate:
         """What is known of the grasp with all data so far."""
-        tracker = self._tracker
-        fit = None if tracker is None else tracker.solve()
-        counts = self._counts()
-        if tracker is None or fit is None:
-            nothing = np.full(3, np.nan)
-            unknown = np.full(3, np.inf)
-            return OnlineGraspEstimate(
-                np.nan if tracker is None else tracker.time,
-                Status.UNOBSERVABLE,
-                self._waiting(),
-                np.full((3, 3), np.nan),
-                nothing,
-                np.diag(np.full(6, np.inf)),
-                self._offset if self.started else np.nan,
-                self.noise.time_offset_sd if self.settings.time_offset else 0.0,
-                nothing,
-                unknown,
-                nothing,
-                unknown,
-                0.0 if tracker is None else tracker.seconds,
-                self.events,
-                *counts,
-            )
-        model, state, full = fit.model, fit.state, tracker.fitter.covariance()
-        where, sd = model.columns, np.sqrt(np.diag(full))
-
-        def known(name: str, size: int) -> tuple[FloatArray, FloatArray]:
-            return (state[name], sd[where[name]]) if name in where else (np.zeros(size), np.zeros(size))
-
-        offset, offset_sd = known("time_offset", 1)
-        resolved = _resolved(full[:3, :3], self.settings.rotation_resolution) and _resolved(
-            full[3:6, 3:6], self.settings.translation_resolution
+        session, counts = self._session, self._counts()
+        fit = None if session is None else session.tracker.solve()
+        if session is None or fit is None:
+            return self._nothing(counts)
+        tracker, model, state, settings = session.tracker, fit.model, fit.state, self.settings
+        full = tracker.fitter.covariance()
+        resolved = _resolved(full[:3, :3], settings.rotation_resolution) and _resolved(
+            full[3:6, 3:6], settings.translation_resolution
         )
-        out = OnlineGraspEstimate(
-            tracker.time,
-            Status.SOLVED if resolved else Status.UNOBSERVABLE,
-            "" if resolved else self._missing(tracker),
-            state["rotation"],
-            state["translation"],
-            full[:6, :6],
-            self._offset + float(offset[0]),
-            float(offset_sd[0]),
-            *known("gyro_bias", 3),
-            *known("accelerometer_bias", 3),
-            tracker.seconds,
-            self.events,
-            *counts,
-            model,
-            state,
-            full,
-            tracker.rate_moment,
+        offset, offset_sd = session.offset, 0.0
+        if "time_offset" in state:
+            where = model.columns["time_offset"].start
+            offset, offset_sd = offset + float(state["time_offset"][0]), float(np.sqrt(full[where, where]))
+        return OnlineGraspEstimate(
+            t=tracker.time,
+            status=Status.SOLVED if resolved else Status.UNOBSERVABLE,
+            message="" if resolved else self._missing(tracker),
+            rotation=state["rotation"],
+            translation=state["translation"],
+            covariance=full[:6, :6],
+            time_offset=offset,
+            time_offset_sd=offset_sd,
+            seconds=tracker.seconds,
+            events=tracker.events,
+            robot=counts[0],
+            hand=counts[1],
+            variables=model.variables,
+            values=state,
+            full_covariance=full,
+            rate_moment=tracker.rate_moment,
         )
-        return out
+
+    def _nothing(self, counts: tuple[StreamCounts, StreamCounts]) -> OnlineGraspEstimate:
+        session = self._session
+        return OnlineGraspEstimate(
+            t=np.nan if session is None else session.tracker.time,
+            status=Status.UNOBSERVABLE,
+            message=self._waiting(),
+            rotation=np.full((3, 3), np.nan),
+            translation=np.full(3, np.nan),
+            covariance=np.diag(np.full(6, np.inf)),
+            time_offset=np.nan if session is None else session.offset,
+            time_offset_sd=self.noise.time_offset_sd if self.settings.time_offset else 0.0,
+            seconds=0.0 if session is None else session.tracker.seconds,
+            events=self.events,
+            robot=counts[0],
+            hand=counts[1],
+            variables=(),
+            values={},
+            full_covariance=np.zeros((0, 0)),
+            rate_moment=np.zeros((3, 3)),
+        )
 
     def _missing(self, tracker: GraspTracker) -> str:
-        return "The motion has not shown all of the grasp yet. " + grasp_words.advice(tracker.rate_moment, None)
+        return "The motion has not shown all of the grasp yet. " + grasp_words.advice(
+            tracker.rate_moment, None
+        )
 
     def _waiting(self) -> str:
         if self._robot is None or self._robot.received == 0:
             return "No sample of the robot yet."
         if self._hand.received == 0:
             return "No sample of the hand yet."
-        if self._tracker is None:
-            if self._correlation > 0.0:
-                return (
-                    f"Robot and hand are not seen to turn together yet (correlation of their angular rates {self._correlation:.2f} at the best "
-                    "offset): move the object about changing axes."
-                )
+        if self._session is not None:
+            return "Too little data of this grasp yet."
+        if self._correlation == 0.0:
             return f"Waiting for {self._start_seconds:g} s of both streams."
-        return "Too little data of this grasp yet."
+        if self._correlation < SMALLEST_CORRELATION:
+            return (
+                f"Robot and hand are not seen to turn together yet (correlation of their angular rates {self._correlation:.2f} "
+                "at the best offset): move the object about changing axes."
+            )
+        return "The motion has not shown the offset between the clocks yet: move the object faster, about changing axes."
 
     def _counts(self) -> tuple[StreamCounts, StreamCounts]:
-        lost = 0 if self._coupler is None else self._coupler.overflown
+        lost = 0 if self._session is None else self._session.coupler.overflown
         robot = StreamCounts() if self._robot is None else _counted(self._robot, lost)
         return robot, _counted(self._hand, 0)
 
     # ---- internals ---------------------------------------------------------------------------------------
 
     def _advance(self) -> None:
-        if self._robot is None:
-            return
-        if self._tracker is None:
-            self._try_start()
-            return
-        assert self._feed is not None and self._coupler is not None and self._setup is not None
-        t, x = self._robot.settled()
-        if t.size * self._setup.robot.step >= _ALMOST * self._block:
-            self._coupler.push(self._feed.push(t, x))
-            self._robot.release(t.size)
-        if self._coupler.available(self._offset) + self._setup.master_step >= _ALMOST * self._block:
-            for piece in self._coupler.pull(self._offset):
-                self._tracker.take(piece)
-            self._offset += self._tracker.taken_clock_shift()
-            self._coupler.release(self._offset)
+        if self._session is not None:
+            self._session.advance()
+        elif self._robot is not None and self._kind is not None and self._hand.received:
+            self._try_start(self._robot, self._kind)
 
-    def _try_start(self) -> None:
+    def _try_start(self, robot: SampleBuffer, kind: RobotKind) -> None:
         """Start when the first seconds suffice."""
-        assert self._robot is not None and self._kind is not None
-        if self._robot.newest < self._next_try or not self._hand.received:
+        if robot.newest < self._next_try:
             return
-        robot, hand = self._robot.everything(), self._hand.everything()
-        if not (enough(*robot, self._start_seconds) and enough(*hand, self._start_seconds)):
+        first, second = robot.everything(), self._hand.everything()
+        if not (enough(*first, self._start_seconds) and enough(*second, self._start_seconds)):
             return
-        self._next_try = self._robot.newest + _RETRY
-        setup = analyse(self._kind, robot, hand, self.noise, self.settings, self.gravity)
+        self._next_try = robot.newest + self._retry
+        self._retry = min(2.0 * self._retry, _LONGEST_RETRY)
+        setup = analyse(kind, first, second, self.noise, self.settings, self.gravity)
         self._correlation = setup.clock.correlation
         if setup.clock.correlation < SMALLEST_CORRELATION:
             return
-        self._robot.start(setup.robot.step, setup.robot.limit)
+        robot.start(setup.robot.step, setup.robot.limit)
         self._hand.start(setup.hand.step, setup.hand.limit)
-        self._setup, self._offset = setup, setup.clock.offset
+        offset = setup.clock.offset
         for _ in range(_MOST_PASSES):
-            error, sd = self._read_start(setup)
+            session = GraspSession(
+                setup, offset, kind, robot, self._hand, self.noise, self.settings, self.prior, self.gravity,
+                self._detector, self._block,
+            )  # fmt: skip
+            error, sd = session.read_start()
             if abs(error) < max(_SETTLED_START, 0.1 * sd):
                 break
-            self._offset += error
-        if sd > _STARTING_OFFSET_SD:
-            self._tracker = None
-            return
-        assert self._tracker is not None and self._coupler is not None
-        self._robot.release(self._robot.settled()[0].size)
-        self._coupler.release(self._offset)
-
-    def _read_start(self, setup: Setup) -> tuple[float, float]:
-        """Read the first seconds with the present offset; returns how wrong that turned out, and its standard deviation (s)."""
-        assert self._robot is not None and self._kind is not None
-        self._feed = feed(setup, self._kind, self.gravity, self.settings.base_tilt)
-        self._coupler = coupler(setup, self._hand, self.settings.base_tilt, self._keep)
-        self._tracker = GraspTracker(
-            setup.step, setup.bandwidth, setup.noise, self.noise, self.settings, self.prior, self._detector, self._block
-        )
-        self._coupler.push(self._feed.push(*self._robot.settled()))
-        for piece in self._coupler.pull(self._offset):
-            self._tracker.take(piece)
-        fit = self._tracker.solve()
-        error = self._tracker.taken_clock_shift()
-        if not self.settings.time_offset:
-            return 0.0, 0.0
-        if fit is None:
-            return 0.0, np.inf
-        where = fit.model.columns["time_offset"].start
-        return error + float(fit.state["time_offset"][0]), float(np.sqrt(self._tracker.fitter.covariance()[where, where]))
+            offset += error
+        if sd <= _STARTING_OFFSET_SD:
+            session.keep_start()
+            self._session = session
 
 
 def _resolved(covariance: FloatArray, resolution: float) -> bool:
@@ -346,14 +326,21 @@ def _resolved(covariance: FloatArray, resolution: float) -> bool:
 
 def _counted(buffer: SampleBuffer, lost: int) -> StreamCounts:
     return StreamCounts(
-        buffer.received, buffer.late, buffer.duplicates, buffer.incomplete, buffer.gaps, buffer.overflown + lost
+        buffer.received,
+        buffer.late,
+        buffer.duplicates,
+        buffer.incomplete,
+        buffer.gaps,
+        buffer.overflown + lost,
     )
 
 
 def _stamps(t: npt.ArrayLike, name: str) -> FloatArray:
     out = np.atleast_1d(np.asarray(t, dtype=np.float64))
     if out.ndim != 1 or not np.isfinite(out).all():
-        raise InputError(name, "a finite time stamp or an array of them, shape (m,) [s]", f"shape {out.shape}: {out}")
+        raise InputError(
+            name, "a finite time stamp or an array of them, shape (m,) [s]", f"shape {out.shape}: {out}"
+        )
     return out
 
 

@@ -1,8 +1,8 @@
 """Has the grasp changed? Log Bayes factors of a change in (R, r) at several times back and of several sizes (mathematics 2.3).
 
-Second moments of short segments say what the newest seconds ask for; snapshots of the running estimate say what was known before each of
-them. With ``g, H`` the gradient and Gauss-Newton matrix of the segments since a start, ``P`` the covariance of the snapshot taken at that start and
-``u = g + H mu`` the gradient at its mean, a jump ``d ~ N(0, D)`` of the grasp shows through
+Second moments of short segments say what the newest seconds ask for; snapshots of the running estimate say what was known before each
+of them. With ``g, H`` the gradient and Gauss-Newton matrix of the segments since a start, ``P`` the covariance of the snapshot taken at
+that start and ``u = g + H mu`` the gradient at its mean, a jump ``d ~ N(0, D)`` of the grasp shows through
 
     W = E' (I + H P)^-1 H E,   q = -E' (I + H P)^-1 u       (E picks rotation and translation)
     log p(segments | jump) / p(segments | none) = 1/2 q' (D^-1 + W)^-1 q - 1/2 log det(I + D W)     for known noise
@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from factorgrasp.online.row_history import RowHistory
-from factorgrasp.typing import FloatArray
+from factorgrasp.typing import FloatArray, IntArray
 
 GRASP = 6
 # Segments since a change at which it is looked for; all of them begin after it.
@@ -46,7 +46,8 @@ class Jump:
     segments : int
         How many segments lie wholly after it.
     log_bayes_factor : float
-        Against no change, with the noise level of the segments since the start: it must convince, also where the noise has just become louder.
+        Against no change, with the noise level of the segments since the start: it must convince, also where the noise has just
+        become louder.
     evidence : float
         The same with one noise level for all segments held, so that starts and kinds of change can be compared.
     step : (6,) ndarray
@@ -76,7 +77,12 @@ class JumpDetector:
         self._snapshots = RowHistory(REACH, size + size**2)
 
     def add_segments(
-        self, times: FloatArray, costs: FloatArray, gradients: FloatArray, informations: FloatArray, residuals: float
+        self,
+        times: FloatArray,
+        costs: FloatArray,
+        gradients: FloatArray,
+        informations: FloatArray,
+        residuals: float,
     ) -> None:
         """Costs (S,), gradients (S, n), Gauss-Newton matrices (S, n, n) at the reference state of segments that end at `times` (S,).
 
@@ -107,8 +113,8 @@ class JumpDetector:
         rows[:, 0] += (rows[:, 2 : 2 + n] + 0.5 * turned) @ shift
         rows[:, 2 : 2 + n] += turned
 
-    def widened(self, where: FloatArray, size: int, variances: FloatArray) -> JumpDetector:
-        """A detector for a model of `size` unknowns, in which those of this one stand at `where` and the new ones have prior `variances` (size,)."""
+    def widened(self, where: IntArray, size: int, variances: FloatArray) -> JumpDetector:
+        """The same for a model of `size` unknowns: those of this one stand at `where`, new ones have prior `variances` (size,)."""
         out = JumpDetector(size)
         n, count = self.size, self._snapshots.kept
         for time, row in zip(self._snapshots.last_times(count), self._snapshots.last(count), strict=True):
@@ -128,7 +134,11 @@ class JumpDetector:
         """Time, mean (n,) and covariance (n, n) of the estimate before a change that the newest `segments` follow."""
         back = segments + GUARD
         row = self._snapshots.last(back)[0]
-        return float(self._snapshots.last_times(back)[0]), row[: self.size], row[self.size :].reshape(self.size, self.size)
+        return (
+            float(self._snapshots.last_times(back)[0]),
+            row[: self.size],
+            row[self.size :].reshape(self.size, self.size),
+        )
 
     def loud(self) -> bool:
         """Whether the newest segment fits much worse than the noise lets expect."""
@@ -201,7 +211,7 @@ class Segments(NamedTuple):
     Attributes
     ----------
     starts : list of int
-    cost, count : (S,) ndarray
+    cost, residuals : (S,) ndarray
         Cost at the reference state, and number of residuals.
     mean, covariance : (S, n) and (S, n, n) ndarray
         Estimate before, relative to the reference state.
@@ -213,7 +223,7 @@ class Segments(NamedTuple):
 
     starts: list[int]
     cost: FloatArray
-    count: FloatArray
+    residuals: FloatArray
     mean: FloatArray
     covariance: FloatArray
     gradient: FloatArray
@@ -246,15 +256,15 @@ def explain(data: Segments, older_cost: FloatArray, older_count: FloatArray) -> 
     gain = square / (1.0 + square * values)
     drop = np.sum(gain * y**2, axis=2)
     occam = 0.5 * np.sum(np.log1p(square * values), axis=2)
-    factor = _student(_PRIOR_RESIDUALS + rss, drop, _PRIOR_RESIDUALS + data.count) - occam
-    before, level = _PRIOR_RESIDUALS + 2.0 * older_cost + rss, _PRIOR_RESIDUALS + older_count + data.count
+    factor = _student(_PRIOR_RESIDUALS + rss, drop, _PRIOR_RESIDUALS + data.residuals) - occam
+    before, level = _PRIOR_RESIDUALS + 2.0 * older_cost + rss, _PRIOR_RESIDUALS + older_count + data.residuals
     evidence = _student(before, drop, level) - occam
     best = np.argmax(evidence, axis=0)
     out = []
     for s, k in enumerate(data.starts):
         b = best[s]
         axes = _UNIT[:, None] * vectors[s]
-        left = (_PRIOR_RESIDUALS + rss[s] - drop[b, s]) / (_PRIOR_RESIDUALS + data.count[s])
+        left = (_PRIOR_RESIDUALS + rss[s] - drop[b, s]) / (_PRIOR_RESIDUALS + data.residuals[s])
         covariance = max(1.0, float(left)) * (axes * gain[b, s]) @ axes.T
         out.append(
             Jump(k, float(factor[b, s]), float(evidence[b, s]), axes @ (gain[b, s] * y[s]), covariance)

@@ -23,7 +23,6 @@ from factorgrasp.problems.grasp_system import floored_inverse
 from factorgrasp.problems.grasp_windows import Windowing
 from factorgrasp.typing import FloatArray
 
-
 # Points a bin over which a density is averaged, and half their range in bins: the spectrum of the sine taper.
 _POINTS, _RANGE = 25, 1.5
 
@@ -55,7 +54,12 @@ class Level:
     """
 
     def __init__(
-        self, bank: WindowBank, robot: RobotNoise, noise: GraspNoise, settings: GraspSettings, lever_arm: FloatArray
+        self,
+        bank: WindowBank,
+        robot: RobotNoise,
+        noise: GraspNoise,
+        settings: GraspSettings,
+        lever_arm: FloatArray,
     ) -> None:
         self.bank = bank
         self._robot, self._noise, self._settings = robot, noise, settings
@@ -141,5 +145,7 @@ class Level:
     def restart(self) -> None:
         """A new grasp: moments go, noise levels stay as what is known beforehand."""
         self.bank.clear()
-        self.declared = BandVariances(self.variances.gyro, self.variances.accelerometer, np.ones_like(self.variances.trusted))
+        self.declared = BandVariances(
+            self.variances.gyro, self.variances.accelerometer, np.ones_like(self.variances.trusted)
+        )
         self._fresh = False

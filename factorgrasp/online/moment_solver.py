@@ -48,7 +48,9 @@ class Moment(NamedTuple):
         """Back from :meth:`to_row`, with `width` entries of z_a."""
         sizes = (GYRO_WIDTH, width, GYRO_WIDTH, width)
         edges = np.cumsum([size**2 for size in sizes])[:-1]
-        return cls(*(part.reshape(size, size) for part, size in zip(np.split(row, edges), sizes, strict=True)))
+        return cls(
+            *(part.reshape(size, size) for part, size in zip(np.split(row, edges), sizes, strict=True))
+        )
 
 
 @dataclass(frozen=True)
@@ -92,7 +94,9 @@ def retract(model: GraspModel, state: State, step: FloatArray) -> dict[str, Floa
 def local(model: GraspModel, origin: State, state: State) -> FloatArray:
     """Tangent step (n,) from `origin` to `state`."""
     parts = [
-        _rotation_between(origin[v.name], state[v.name]) if v.manifold == "rotation" else state[v.name] - origin[v.name]
+        _rotation_between(origin[v.name], state[v.name])
+        if v.manifold == "rotation"
+        else state[v.name] - origin[v.name]
         for v in model.variables
     ]
     return np.concatenate(parts)
@@ -138,9 +142,9 @@ class Linearised:
     def normals(
         self, moments: tuple[FloatArray, FloatArray], noise: tuple[FloatArray, FloatArray]
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Costs (S,), gradients (S, n) and covariances of these (S, n, n) of `moments` (S, 10, 10) and (S, m, m) with expected `noise` in each.
+        """Costs (S,), gradients (S, n) and covariances of these (S, n, n) of `moments` (S, 10, 10) and (S, m, m).
 
-        The noise is taken out of the gradients only: the covariance of a gradient has it in, and stays positive semidefinite.
+        The expected `noise` in each is taken out of the gradients only: their covariance has it in, and stays positive semidefinite.
         """
         n = self._size
         cost, gradient, information = np.zeros(1), np.zeros(1), np.zeros(1)
@@ -174,8 +178,8 @@ def descend(
     indefinite : bool
         The moments may have negative eigenvalues, since their expected noise was taken out; their positive part is used.
     tolerance : float
-        The last step is still taken. It is off by its square times the curvature, which is tiny: half a standard deviation is a good tolerance
-        for a warm start.
+        The last step is still taken. It is off by its square times the curvature, which is tiny: half a standard deviation is a good
+        tolerance for a warm start.
     """
     Z_g, Z_a = moment.gyro, moment.accelerometer
     if indefinite:
@@ -183,7 +187,7 @@ def descend(
     state, cost, gained = dict(start), 0.0, 0.0
     for _ in range(iterations):
         cost, gradient, H, J_g, J_a = _normal(model, state, Z_g, Z_a, prior)
-        step = -np.linalg.solve(H, gradient)
+        step = np.asarray(-np.linalg.solve(H, gradient), dtype=np.float64)
         state = retract(model, state, step)
         gained = -float(step @ gradient)
         if gained < tolerance**2:
@@ -222,7 +226,9 @@ def _meat(J_g: FloatArray, J_a: FloatArray, moment: Moment, prior: GaussianPrior
 def _prior_error(model: GraspModel, prior: GaussianPrior, state: State) -> FloatArray:
     if prior.knows_rotation:
         return local(model, prior.mean, state)
-    parts = [np.zeros(3) if v.name == "rotation" else state[v.name] - prior.mean[v.name] for v in model.variables]
+    parts = [
+        np.zeros(3) if v.name == "rotation" else state[v.name] - prior.mean[v.name] for v in model.variables
+    ]
     return np.concatenate(parts)
 
 

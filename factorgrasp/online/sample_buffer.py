@@ -14,9 +14,9 @@ _FIRST_ROWS = 2048
 class SampleBuffer:
     """A bounded queue of rows in order of their stamps.
 
-    Rows up to the *frontier* are settled: nothing will be put between them any more. On a regular stream every row is settled on arrival. Where a stamp is
-    missing, the rows behind the hole wait for it until the newest stamp is `lateness` ahead; then the hole is a gap. What comes later than that is
-    dropped and counted.
+    Rows up to the *frontier* are settled: nothing will be put between them any more. On a regular stream every row is settled on
+    arrival. Where a stamp is missing, the rows behind the hole wait for it until the newest stamp is `lateness` ahead; then the hole is
+    a gap. What comes later than that is dropped and counted.
 
     Parameters
     ----------

@@ -54,7 +54,11 @@ class SlowWatch:
         best, drift = self._detector.shapes(self._settings.give)
         slips = drift.evidence > best.evidence
         found = drift if slips else best
-        if found.segments < _YOUNGEST or found.evidence < self._settings.log_bayes_factor or not self._settings.reports(found.step):
+        if (
+            found.segments < _YOUNGEST
+            or found.evidence < self._settings.log_bayes_factor
+            or not self._settings.reports(found.step)
+        ):
             return None
         start, mean, covariance = self._detector.snapshot(found.segments)
         where = columns_of(self._model, tuple(v.name for v in self._fitter.model.variables))
@@ -80,7 +84,9 @@ class SlowWatch:
         # Where the model check found the noise model too narrow, it is so here, too.
         where = columns_of(wide.model, tuple(v.name for v in fit.model.variables))
         wider = np.ones(wide.model.size)
-        wider[where] = np.sqrt(np.maximum(np.diag(self._fitter.covariance()) / np.diag(fit.covariance()), 1.0))
+        wider[where] = np.sqrt(
+            np.maximum(np.diag(self._fitter.covariance()) / np.diag(fit.covariance()), 1.0)
+        )
         covariance = wider[:, None] * covariance * wider
         if self._detector is None or self._reference is None:
             self._model, self._detector = wide.model, JumpDetector(wide.model.size)

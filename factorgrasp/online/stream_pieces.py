@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from factorgrasp import signals
-from factorgrasp.typing import FloatArray
+from factorgrasp.typing import BoolArray, FloatArray
 
 
 class Piece(NamedTuple):
@@ -44,7 +44,7 @@ class GapCutter:
         if whole and np.isfinite(x).all():
             self._last = t[-1]
             return [Piece(t, x, first)]
-        good = np.isfinite(x).all(axis=1)
+        good: BoolArray = np.asarray(np.isfinite(x).all(axis=1))
         starts = np.concatenate([[first], ~(t[1:] - t[:-1] <= self.limit)])
         # A new piece begins after every long step and after every incomplete row.
         starts[1:] |= ~good[:-1]
@@ -94,7 +94,7 @@ class GridInterpolator:
         count = int(np.floor((self._t[-2] - self._next) / self.step + 1e-9)) + 1
         if count <= 0:
             return []
-        times = self._next + self.step * np.arange(count)
+        times: FloatArray = self._next + self.step * np.arange(count, dtype=np.float64)
         out = Piece(times, self._interpolate(self._t, self._x, times), self._starts)
         self._next, self._starts = float(times[-1] + self.step), False
         keep = max(int(np.searchsorted(self._t, self._next)) - 2, 0)

@@ -29,14 +29,14 @@ from factorgrasp.typing import FloatArray, State
 
 # s; the change detector looks at windows of twice this length, one every such time.
 SEGMENT = 0.04
-# Reviews of the weights: often while the estimate is young, then now and then (s of data).
-_YOUNG, _OFTEN, _SELDOM = 5.0, 0.5, 3.0
+# Reviews of the weights: after so many seconds of data, and after every further tenth of all data, within these limits (s).
+_OFTEN, _SELDOM, _SHARE = 0.5, 5.0, 0.1
 # Other local optima are looked for within the first seconds only.
 _SURE = 20.0
 # A remaining clock offset above this (s) is applied to the data; the model is linear in what remains.
 _SETTLED_OFFSET = 1e-4
-# s; a change that is found this soon after another one is the same one going on, as is a small one (and a drift) a little later. What goes on
-# again and again for longer than the latter is a slip.
+# s; a change that is found this soon after another one is the same one going on, as is a small one (and a drift) a little later. What
+# goes on again and again for longer than the latter is a slip.
 _SAME_CHANGE, _AFTERMATH = 1.0, 4.0
 # s; before so much data of the grasp after, the detector knows better how far a change went.
 _SETTLING = 0.5
@@ -221,7 +221,7 @@ class GraspTracker:
             self._watch.remember(self.time)
 
     def _review(self) -> None:
-        self._next_review = self.seconds + (_OFTEN if self.seconds < _YOUNG else _SELDOM)
+        self._next_review = self.seconds + min(max(_OFTEN, _SHARE * self.seconds), _SELDOM)
         self.fitter.review(self.seconds < _SURE, self._force / self._rows, self.rate_moment)
         fit = self.fitter.fit
         assert fit is not None
@@ -238,7 +238,9 @@ class GraspTracker:
     def _start_afresh(self, change: Change) -> None:
         self._note(change)
         step = _padded(change.jump.step, self.fitter.model.size)
-        self.fitter.restart(change.before, change.before_covariance, retract(self.fitter.model, change.before, step))
+        self.fitter.restart(
+            change.before, change.before_covariance, retract(self.fitter.model, change.before, step)
+        )
         self._begin()
         kept = min(change.rows, self.history.kept)
         self.history.run = kept

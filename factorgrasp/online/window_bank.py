@@ -1,7 +1,7 @@
 """Sliding spectral windows and their second moments, in constant memory.
 
-The batch problem's windows (:mod:`factorgrasp.problems.grasp_windows`) start every half window. Here one starts every few rows, so that new data enter at once,
-and counts ``2 hop / length`` of a window: the squared tapers of all of them still sum to one.
+The batch problem's windows (:mod:`factorgrasp.problems.grasp_windows`) start every half window. Here one starts every few rows, so that
+new data enter at once, and counts ``2 hop / length`` of a window: the squared tapers of all of them still sum to one.
 """
 
 from __future__ import annotations
@@ -37,7 +37,12 @@ class WindowBank:
     """
 
     def __init__(
-        self, windowing: Windowing, hop: int, width: int, forgetting_time: float | None = None, robust: bool = False
+        self,
+        windowing: Windowing,
+        hop: int,
+        width: int,
+        forgetting_time: float | None = None,
+        robust: bool = False,
     ) -> None:
         self.windowing, self.hop, self.width = windowing, hop, width
         self.basis = windowing.basis()
@@ -156,10 +161,17 @@ class WindowBank:
         T = np.eye(GYRO_WIDTH + self.width)
         shift_hand(T.T, shift)
         T_g, T_a = T[GYRO, GYRO], T[ACCELEROMETER, ACCELEROMETER]
-        for values, change in ((self._gyro, T_g), (self._total_gyro, T_g), (self._accelerometer, T_a), (self._total_accelerometer, T_a)):
+        for values, change in (
+            (self._gyro, T_g),
+            (self._total_gyro, T_g),
+            (self._accelerometer, T_a),
+            (self._total_accelerometer, T_a),
+        ):
             values[...] = change @ values @ change.T
 
-    def weighted(self, weights: tuple[FloatArray, FloatArray], squared: bool = False) -> tuple[FloatArray, FloatArray]:
+    def weighted(
+        self, weights: tuple[FloatArray, FloatArray], squared: bool = False
+    ) -> tuple[FloatArray, FloatArray]:
         """Sums over bins (10, 10) and (m, m) of the moments times `weights` (K,) of both sensors."""
         power = int(squared and self._weighted)
         scale = self._scale ** (power + 1)

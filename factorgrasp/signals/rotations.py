@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -72,30 +73,37 @@ def differentiate_rotations(
     if n < window:
         raise InputError("rotation", f"at least one window of {window} samples", f"{n} samples")
     q = lie.matrix_to_quaternion_wxyz(values) if as_matrix else values
-    integrals = _integrated_rates(q, dt)
-
-    half = window // 2
-    smooth, first, second = (savgol_weights(window, order, deriv, dt) for deriv in (0, 1, 2))
-
-    def on_steps(weights: FloatArray) -> FloatArray:
-        # sum_j c_j psi_{k+j} with sum_j c_j = 0, written in the steps of psi: no running sum that a gap would
-        # break.
-        return np.ascontiguousarray(np.cumsum(weights[::-1])[::-1][1:])
-
-    shift = np.array(smooth)
-    shift[half] -= 1.0  # of psi_{k+j} - psi_k: the correction to R_k
-    delta = correlate_centred(integrals, on_steps(shift), n)
+    integrals = integrated_rates(q, dt)
+    shift, first, second = rotation_filters(window, order, dt).T
+    delta = correlate_centred(integrals, shift, n)
     smoothed = lie.quaternion_multiply_wxyz(q, lie.quaternion_exp_wxyz(delta))
     return RotationDerivatives(
         lie.quaternion_wxyz_to_matrix(smoothed) if as_matrix else smoothed,
-        correlate_centred(integrals, on_steps(first), n),
-        correlate_centred(integrals, on_steps(second), n),
+        correlate_centred(integrals, first, n),
+        correlate_centred(integrals, second, n),
     )
 
 
-def _integrated_rates(q: FloatArray, dt: float) -> FloatArray:
-    """Integral of the body rate over each step, (n - 1, 3), from quaternions [w, x, y, z], (n, 4)."""
-    steps = lie.quaternion_log_wxyz(lie.quaternion_multiply_wxyz(lie.quaternion_conjugate(q[:-1]), q[1:]))
+@lru_cache(maxsize=64)
+def rotation_filters(window: int, order: int, dt: float) -> FloatArray:
+    """Weights (window - 1, 3) of the integrated rates around a sample: for the smoothing correction, the rate and the acceleration."""
+    weights = [np.array(savgol_weights(window, order, deriv, dt)) for deriv in (0, 1, 2)]
+    weights[0][window // 2] -= 1.0  # of psi_{k+j} - psi_k: the correction to R_k
+    # sum_j c_j psi_{k+j} with sum_j c_j = 0, written in the steps of psi: no running sum that a gap would break.
+    out = np.stack([np.cumsum(c[::-1])[::-1][1:] for c in weights], axis=1)
+    out.setflags(write=False)
+    return out
+
+
+def rotation_steps(q: FloatArray, dt: float) -> FloatArray:
+    """Rotation vectors ``log(R_k' R_{k+1})``, (n - 1, 3), between quaternions [w, x, y, z], (n, 4)."""
+    a, b = q[:-1], q[1:]
+    # log(conj(a) b), written out: this also runs on a few samples at a time.
+    w = np.einsum("ij,ij->i", a, b)
+    v = a[:, :1] * b[:, 1:] - b[:, :1] * a[:, 1:] - cross(a[:, 1:], b[:, 1:])
+    sine = np.sqrt(np.einsum("ij,ij->i", v, v))
+    scale = 2.0 * np.arctan2(sine, np.abs(w)) / np.where(sine == 0.0, 1.0, sine)
+    steps = np.copysign(scale, w)[:, None] * v
     square = np.einsum("ij,ij->i", steps, steps)
     if np.any(square > LARGEST_ROTATION_PER_SAMPLE**2):
         row = int(np.nanargmax(square))
@@ -105,6 +113,17 @@ def _integrated_rates(q: FloatArray, dt: float) -> FloatArray:
             f"{np.rad2deg(np.sqrt(square[row])):.1f} deg from sample {row} to {row + 1} ({dt:g} s)",
             "Sample faster, or check the quaternions' order [w, x, y, z]",
         )
+    return np.asarray(steps)
+
+
+def coning(steps: FloatArray, change: FloatArray) -> FloatArray:
+    """What a rotation step (n, 3) has more than the integral of the rate, with its `change` from one step to the next."""
+    return cross(steps, change) / 12.0
+
+
+def integrated_rates(q: FloatArray, dt: float) -> FloatArray:
+    """Integral of the body rate over each step, (n - 1, 3), from quaternions [w, x, y, z], (n, 4)."""
+    steps = rotation_steps(q, dt)
     before, after = np.empty_like(steps), np.empty_like(steps)
     before[1:], before[0] = steps[:-1], np.nan
     after[:-1], after[-1] = steps[1:], np.nan
@@ -115,12 +134,12 @@ def _integrated_rates(q: FloatArray, dt: float) -> FloatArray:
     lone = np.isnan(change)
     change[lone] = (steps - before)[lone]
     np.nan_to_num(change, copy=False)
-    out: FloatArray = steps - _cross(steps, change) / 12.0
+    out: FloatArray = steps - coning(steps, change)
     return out
 
 
-def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    # numpy.cross takes five times as long.
+def cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """``a x b`` of rows (n, 3); numpy.cross takes five times as long."""
     out = np.empty_like(a)
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         out[:, i] = a[:, j] * b[:, k] - a[:, k] * b[:, j]
