@@ -1,9 +1,11 @@
 """The online grasp estimator: cost, memory, consistency, regrasps and slips found, false alarms, agreement with the batch estimate.
 
-    OMP_NUM_THREADS=1 python benchmarks/online_grasp_benchmark.py [--seeds 50] [--quick] [--data DATA_FOLDER] [--out benchmarks/results]
+    OMP_NUM_THREADS=1 python benchmarks/online_grasp_benchmark.py [--seeds 50] [--quick] [--data DATA_FOLDER]
+    [--out benchmarks/results]
 
-Writes ``online_grasp_benchmark.md`` and ``online_grasp_benchmark.json``; ends with exit code 1 when a target is missed. About ten
-minutes on two cores; ``--quick`` takes about two: its seeds are too few for ratios to be judged.
+Writes ``online_grasp_benchmark.md`` and ``online_grasp_benchmark.json``; ends with exit code 1 when a target
+is missed. About ten minutes on two cores; ``--quick`` takes about two: its seeds are too few for ratios to be
+judged.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ import time
 import tracemalloc
 from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +31,7 @@ from factorgrasp import solve
 from factorgrasp.atomic import write_text
 from factorgrasp.online import GraspEvent, OnlineGraspPose
 from factorgrasp.problems import GraspPose, GraspSettings
-from factorgrasp.recordings import ImuStream, MotionStream
+from factorgrasp.recordings import ImuStream
 from factorgrasp.simulation.cehajic2015 import (
     ENCODER_NOISE,
     ENCODER_POSES,
@@ -51,7 +53,8 @@ CHANGE = 30.0
 FEWEST_SEEDS = 30
 
 LIMITATIONS = (
-    "Processor times go through Python and scatter by a third with what else the machine does; the median over blocks is the steadier number.",
+    "Processor times go through Python and scatter by a third with what else the machine does; the "
+    "median over blocks is the steadier number.",
     "The simulated sensors are white, biased by constants and exact in scale; the hand is rigid on the object, and a regrasp is a jump.",
     "What can be found how soon depends on the motion: here slow wide turns with a small cone at 0.6 Hz (scenario cehajic2015).",
     "broad and euroc_v102 hold no regrasp: they test for false alarms only.",
@@ -59,19 +62,26 @@ LIMITATIONS = (
 )
 
 
-# ---- cost and memory ----------------------------------------------------------------------------------------
+# ---- cost and memory
+# ----------------------------------------------------------------------------------------
 
 
 def cost(seconds: float) -> tuple[Table, list[Metric]]:
     """Processor time of 1 kHz on both sides in chunks of 20, with an estimate after each."""
     rows, metrics = [], []
-    cases = (("motion", ENCODER_NOISE, True), ("poses", ENCODER_POSES, True), ("motion, no detector", ENCODER_NOISE, False))
+    cases = (
+        ("motion", ENCODER_NOISE, True),
+        ("poses", ENCODER_POSES, True),
+        ("motion, no detector", ENCODER_NOISE, False),
+    )
     for words, robot, detects in cases:
         recording = cehajic2015(0, duration=seconds, robot=robot, time_offset=OFFSET)
         spent: list[float] = []
         last = [time.process_time()]
 
-        def estimate(estimator: OnlineGraspPose, spent: list[float] = spent, last: list[float] = last) -> None:
+        def estimate(
+            estimator: OnlineGraspPose, spent: list[float] = spent, last: list[float] = last
+        ) -> None:
             estimator.estimate()
             now = time.process_time()
             spent.append(now - last[0])
@@ -104,7 +114,9 @@ def cost(seconds: float) -> tuple[Table, list[Metric]]:
         Column("median", "median of blocks", "us", ".1f", 1e6),
         Column("worst", "longest block (99.9 %)", "ms", ".1f", 1e3),
     )
-    return Table(columns, tuple(rows), "Processor time a sample: 1 kHz on both sides, an estimate every 20 ms"), metrics
+    return Table(
+        columns, tuple(rows), "Processor time a sample: 1 kHz on both sides, an estimate every 20 ms"
+    ), metrics
 
 
 def memory(minutes: float) -> list[Metric]:
@@ -130,7 +142,9 @@ def memory(minutes: float) -> list[Metric]:
         estimator.add_hand(
             t + OFFSET,
             hand.angular_velocity + truth.gyro_bias + XSENS.gyro_noise_density * 31.6 * noise[3],
-            hand.specific_force(source.gravity) + truth.accelerometer_bias + XSENS.accelerometer_noise_density * 31.6 * noise[4],
+            hand.specific_force(source.gravity)
+            + truth.accelerometer_bias
+            + XSENS.accelerometer_noise_density * 31.6 * noise[4],
         )
         used.append(tracemalloc.get_traced_memory()[0])
     tracemalloc.stop()
@@ -139,15 +153,25 @@ def memory(minutes: float) -> list[Metric]:
     growth = float(np.mean(used[-half // 2 :]) - np.mean(used[len(used) // 4 : half]))
     error = estimator.estimate().error_to(truth.rotation, truth.translation)
     return [
-        Metric("memory growth over the stream", growth / 1024, "KiB", "lower", 64.0, f"{minutes:g} min at 1 kHz, last quarter against second"),
+        Metric(
+            "memory growth over the stream",
+            growth / 1024,
+            "KiB",
+            "lower",
+            64.0,
+            f"{minutes:g} min at 1 kHz, last quarter against second",
+        ),
         Metric("memory in use", used[-1] / 2**20, "MiB"),
         Metric("events in that stream", float(len(estimator.events)), "", "lower", 0.0),
         Metric("lever arm's error at its end", 1e3 * float(np.linalg.norm(error[3:])), "mm"),
-        Metric("processor time a sample, simulation and tracing included", 1e6 * spent / (minutes * 60_000), "us"),
+        Metric(
+            "processor time a sample, simulation and tracing included", 1e6 * spent / (minutes * 60_000), "us"
+        ),
     ]
 
 
-# ---- consistency ----------------------------------------------------------------------------------------------
+# ---- consistency
+# ----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -189,7 +213,10 @@ def consistency(task: tuple[str, int]) -> Consistency:
                 found.append((size, float(np.linalg.norm(error[:3])), float(np.linalg.norm(error[3:]))))
 
     estimator = stream(OnlineGraspPose(settings=settings), recording.robot, recording.hand, 100, look, OFFSET)
-    estimate, batch = estimator.estimate(), solve(GraspPose(recording.robot, recording.hand, settings=settings))
+    estimate, batch = (
+        estimator.estimate(),
+        solve(GraspPose(recording.robot, recording.hand, settings=settings)),
+    )
     apart = estimate.error_to(batch.rotation, batch.translation) / np.sqrt(np.diag(batch.covariance))
     columns = tuple(zip(*found, strict=True))
     return Consistency(case, MOMENTS, *columns, len(estimate.events), tuple(np.abs(apart)))
@@ -215,15 +242,33 @@ def summarize_consistency(results: list[Consistency], seeds: int) -> tuple[Table
             )
             if moment >= 20.0:
                 metric = Metric(
-                    f"NEES per dof, {case}, after {moment:g} s", float(values[:, k].mean()), "", "within", band
+                    f"NEES per dof, {case}, after {moment:g} s",
+                    float(values[:, k].mean()),
+                    "",
+                    "within",
+                    band,
                 )
                 metrics.append(metric if seeds >= FEWEST_SEEDS else metric.without_target("too few seeds"))
         away = np.array([r.batch for r in mine])
         metrics.append(
-            Metric(f"distance to the batch estimate, {case}", float(away.max()), "sigma", "lower", 1.0, "largest of all seeds and components")
+            Metric(
+                f"distance to the batch estimate, {case}",
+                float(away.max()),
+                "sigma",
+                "lower",
+                1.0,
+                "largest of all seeds and components",
+            )
         )
         metrics.append(
-            Metric(f"false alarms, {case}", float(sum(r.events for r in mine)), "", "lower", 0.0, f"{len(mine)} x 60 s")
+            Metric(
+                f"false alarms, {case}",
+                float(sum(r.events for r in mine)),
+                "",
+                "lower",
+                0.0,
+                f"{len(mine)} x 60 s",
+            )
         )
     columns = (
         Column("case"),
@@ -258,7 +303,11 @@ CHANGES: dict[str, tuple[Callable[[int], GraspRecording], str, float]] = {
     "70 mm": (lambda seed: grasp_regrasp(seed, at=CHANGE, angle=0.0), "regrasp", 5.0),
     "20 mm": (lambda seed: grasp_regrasp(seed, at=CHANGE, angle=0.0, distance=0.02), "regrasp", 5.0),
     "10 deg": (lambda seed: grasp_regrasp(seed, at=CHANGE, distance=0.0), "regrasp", 0.2),
-    "2 deg": (lambda seed: grasp_regrasp(seed, at=CHANGE, angle=np.deg2rad(2.0), distance=0.0), "regrasp", 5.0),
+    "2 deg": (
+        lambda seed: grasp_regrasp(seed, at=CHANGE, angle=np.deg2rad(2.0), distance=0.0),
+        "regrasp",
+        5.0,
+    ),
     "slip, 3 deg, 20 mm in 20 s": (lambda seed: grasp_slip(seed, at=20.0), "slip", 20.0),
 }
 
@@ -266,7 +315,7 @@ CHANGES: dict[str, tuple[Callable[[int], GraspRecording], str, float]] = {
 def detection(task: tuple[str, int]) -> Detection:
     """Feed a change and see what is told of it."""
     case, seed = task
-    make, kind, _ = CHANGES[case]
+    make, _, _ = CHANGES[case]
     recording = make(seed)
     truth = recording.truth
     change = truth.changes[0]
@@ -289,7 +338,16 @@ def detection(task: tuple[str, int]) -> Detection:
     error = estimate.error_to(end_R[0], end_p[0])
     matching = [event for event in estimate.events if event.detected >= change.start]
     if not matching:
-        return Detection(case, False, "", np.nan, np.nan, np.nan, len(estimate.events), nees(error, estimate.covariance) / 6)
+        return Detection(
+            case,
+            False,
+            "",
+            np.nan,
+            np.nan,
+            np.nan,
+            len(estimate.events),
+            nees(error, estimate.covariance) / 6,
+        )
     event = matching[0]
     return Detection(
         case,
@@ -327,7 +385,9 @@ def summarize_detection(results: list[Detection]) -> tuple[Table, list[Metric]]:
                 "extra": sum(r.extra for r in mine),
                 "median": float(np.median(delays)) if delays.size else np.nan,
                 "worst": float(delays.max()) if delays.size else np.nan,
-                "begin": float(np.median([abs(r.time_error) for r in mine if r.found])) if delays.size else np.nan,
+                "begin": float(np.median([abs(r.time_error) for r in mine if r.found]))
+                if delays.size
+                else np.nan,
                 "size": float(np.mean([r.size_nees for r in mine if r.found])) if delays.size else np.nan,
                 "after": float(np.mean([r.nees_after for r in mine])),
             }
@@ -336,7 +396,13 @@ def summarize_detection(results: list[Detection]) -> tuple[Table, list[Metric]]:
         metrics += [
             Metric(f"found within, {case}", late, "s", "lower", limit, f"the slowest of {len(mine)} seeds"),
             Metric(f"other events, {case}", float(sum(r.extra for r in mine)), "", "lower", 0.0),
-            Metric(f"share called a {kind}, {case}", sum(r.kind == kind for r in mine) / len(mine), "", "higher", 0.9),
+            Metric(
+                f"share called a {kind}, {case}",
+                sum(r.kind == kind for r in mine) / len(mine),
+                "",
+                "higher",
+                0.9,
+            ),
         ]
     columns = (
         Column("case", "change"),
@@ -350,10 +416,13 @@ def summarize_detection(results: list[Detection]) -> tuple[Table, list[Metric]]:
         Column("size", "NEES per dof of its size", "", ".2f"),
         Column("after", "NEES per dof at the end", "", ".2f"),
     )
-    return Table(columns, tuple(rows), "Regrasps and slips", ("Time counts from the newest sample that was fed.",)), metrics
+    return Table(
+        columns, tuple(rows), "Regrasps and slips", ("Time counts from the newest sample that was fed.",)
+    ), metrics
 
 
-# ---- real recordings -----------------------------------------------------------------------------------------
+# ---- real recordings
+# -----------------------------------------------------------------------------------------
 
 
 def real(data: Path) -> tuple[Table, list[Metric], str]:
@@ -362,7 +431,10 @@ def real(data: Path) -> tuple[Table, list[Metric], str]:
     shift, turn = transforms(1)[0]
     for path in sorted((data / "broad").glob("*.npz")):
         robot, hand = read_broad(path)
-        trials += [(path.stem, robot, hand), (f"{path.stem}, moved {SHIFT:g} m", moved_body(robot, shift, turn), hand)]
+        trials += [
+            (path.stem, robot, hand),
+            (f"{path.stem}, moved {SHIFT:g} m", moved_body(robot, shift, turn), hand),
+        ]
     if (data / "euroc_v102").is_dir():
         robot, hand, _ = read_euroc(data / "euroc_v102")
         trials.append(("euroc_v102", robot, hand))
@@ -372,7 +444,9 @@ def real(data: Path) -> tuple[Table, list[Metric], str]:
     for name, robot, hand in trials:
         estimate = stream(OnlineGraspPose(), robot, hand, 1).estimate()
         batch = solve(GraspPose(robot, hand))
-        apart = np.abs(estimate.error_to(batch.rotation, batch.translation) / np.sqrt(np.diag(batch.covariance)))
+        apart = np.abs(
+            estimate.error_to(batch.rotation, batch.translation) / np.sqrt(np.diag(batch.covariance))
+        )
         rows.append(
             {
                 "trial": name,
@@ -385,16 +459,38 @@ def real(data: Path) -> tuple[Table, list[Metric], str]:
             }
         )
     alarms = 0
-    for name, robot, hand in trials:
+    for _, robot, hand in trials:
         # The same motion from other beginnings: a young estimate is where a false alarm would come from.
         good = robot.t[robot.valid]
         for start in np.arange(good[0] + 3.0, good[-1] - 12.0, 8.0):
             part = robot.slice(float(start), float(good[-1]))
-            alarms += len(stream(OnlineGraspPose(), part, hand.slice(float(start) - 0.1, hand.t[-1]), 50).events)
+            alarms += len(
+                stream(OnlineGraspPose(), part, hand.slice(float(start) - 0.1, hand.t[-1]), 50).events
+            )
     metrics = [
-        Metric("false alarms, real recordings", float(sum(r["events"] for r in rows)), "", "lower", 0.0, f"{len(rows)} streams, sample by sample"),
-        Metric("false alarms, begun at other times", float(alarms), "", "lower", 0.0, "every 8 s into each recording"),
-        Metric("distance to the batch estimate, real recordings", max(r["apart"] for r in rows), "sigma", "lower", 1.0),
+        Metric(
+            "false alarms, real recordings",
+            float(sum(r["events"] for r in rows)),
+            "",
+            "lower",
+            0.0,
+            f"{len(rows)} streams, sample by sample",
+        ),
+        Metric(
+            "false alarms, begun at other times",
+            float(alarms),
+            "",
+            "lower",
+            0.0,
+            "every 8 s into each recording",
+        ),
+        Metric(
+            "distance to the batch estimate, real recordings",
+            max(r["apart"] for r in rows),
+            "sigma",
+            "lower",
+            1.0,
+        ),
     ]
     columns = (
         Column("trial"),
@@ -408,7 +504,8 @@ def real(data: Path) -> tuple[Table, list[Metric], str]:
     return Table(columns, tuple(rows), "Real recordings"), metrics, ""
 
 
-# ---- the whole -------------------------------------------------------------------------------------------------
+# ---- the whole
+# -------------------------------------------------------------------------------------------------
 
 
 def parallel(call: Callable[[Any], Any], tasks: Iterable[Any], workers: int) -> list[Any]:
@@ -421,7 +518,9 @@ def parallel(call: Callable[[Any], Any], tasks: Iterable[Any], workers: int) -> 
 
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     default = os.environ.get("FACTORGRASP_DATA") or Path(__file__).resolve().parents[2] / "shared" / "data"
     parser.add_argument("--seeds", type=int, default=50, help="Monte-Carlo seeds")
     parser.add_argument("--quick", action="store_true", help=f"{QUICK_SEEDS} seeds and a shorter stream")
@@ -470,7 +569,9 @@ def main(arguments: list[str] | None = None) -> int:
     lines += ["", "## Conditions", "", *(f"- {key}: {value}" for key, value in conditions.items())]
     lines += [f"- skipped: {skipped}"] if skipped else []
     lines += ["", "## Limitations", "", *(f"- {words}" for words in LIMITATIONS), ""]
-    page = "\n".join(lines) + "\n" + "\n".join(t.markdown() for t in [metric_table(metrics, "Targets"), *tables])
+    page = (
+        "\n".join(lines) + "\n" + "\n".join(t.markdown() for t in [metric_table(metrics, "Targets"), *tables])
+    )
     print(page)
     write_text(chosen.out / "online_grasp_benchmark.md", page)
     everything = {

@@ -25,7 +25,9 @@ def add_robot(estimator: OnlineGraspPose, robot: Stream, rows: slice) -> None:
         )
     else:
         estimator.add_robot(
-            robot.t[rows], angular_velocity=robot.angular_velocity[rows], specific_force=robot.specific_force[rows]
+            robot.t[rows],
+            angular_velocity=robot.angular_velocity[rows],
+            specific_force=robot.specific_force[rows],
         )
 
 

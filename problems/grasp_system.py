@@ -155,8 +155,10 @@ def wahba_start(cross: FloatArray, prior: GraspPrior) -> FloatArray:
     return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
 
 
-def insignificant(variables: tuple[Variable, ...], state: State, covariance: FloatArray) -> frozenset[str]:
-    """Groups of sensor errors that the data do not show to differ from zero (chi-square of the whole group, 99.9 %)."""
+def insignificant(
+    variables: tuple[Variable, ...], state: State, covariance: FloatArray, false_alarm: float = 1e-3
+) -> frozenset[str]:
+    """Groups of sensor errors that the data do not show to differ from zero (chi-square of the whole group)."""
     # scipy.stats would take a second to import, in the middle of a live stream.
     from scipy.special import chdtri
 
@@ -166,7 +168,7 @@ def insignificant(variables: tuple[Variable, ...], state: State, covariance: Flo
         if variable.name in SENSOR_ERRORS:
             part = covariance[where[variable.name], where[variable.name]]
             value = state[variable.name]
-            if value @ np.linalg.solve(part, value) < chdtri(variable.size, 0.001):
+            if value @ np.linalg.solve(part, value) < chdtri(variable.size, false_alarm):
                 out.add(variable.name)
     return frozenset(out)
 

@@ -29,6 +29,8 @@ _SLIP_SHARE = 0.05
 _SHORTEST_SLIP = 20
 # Starts are all tried at every sixth segment, the newest ones whenever a segment fits badly.
 _FULL_TEST, _QUICK_STARTS = 6, 4
+# Moments for a second, closer look are kept at every third segment.
+_MOMENTS_EVERY = 3
 # Segments of a second, roughly.
 _SECOND = 25
 # A reference this far (tangent step) from the estimate before makes its snapshots worthless.
@@ -52,7 +54,7 @@ class ChangeWatch:
         self._fitter, self._segment, self._settings = fitter, segment, settings
         self._coefficients = RowHistory(REACH, fitter.short.bank.windowing.bins * 2 * columns)
         width = fitter.long.bank.width
-        self._moments = RowHistory(REACH, 2 * (GYRO_WIDTH**2 + width**2))
+        self._moments = RowHistory(REACH // _MOMENTS_EVERY + 2, 2 * (GYRO_WIDTH**2 + width**2))
         self._reference: State | None = None
         self._lines: Linearised | None = None
         self._model: GraspModel = fitter.model
@@ -79,7 +81,8 @@ class ChangeWatch:
         self._detector.add_snapshot(time, mean, covariance)
         level = self._fitter.level
         assert level is not None
-        self._moments.append(np.array([time]), level.moment().to_row()[None], False)
+        if self._turn % _MOMENTS_EVERY == 0:
+            self._moments.append(np.array([time]), level.moment().to_row()[None], False)
         if self._in_second == _SECOND:
             self._in_second = 0
             self._slow.remember(time)
@@ -89,10 +92,7 @@ class ChangeWatch:
         fit = self._fitter.fit
         assert fit is not None
         if fit.model is not self._model:
-            precision = np.diag(self._fitter.prior.information)
-            where = columns_of(fit.model, tuple(v.name for v in self._model.variables))
-            self._detector = self._detector.widened(where, fit.model.size, 1.0 / precision)
-            self._model = fit.model
+            self._change_model(fit.model)
         if self._reference is not None:
             shift = local(self._model, {**fit.state, **self._reference}, fit.state)
             self._detector.move(shift)
@@ -102,6 +102,18 @@ class ChangeWatch:
         self._reference, self._lines = fit.state, Linearised(self._model, fit.state)
         self._detector.forget_segments()
         self._give_segments(self._coefficients.kept)
+
+    def _change_model(self, model: GraspModel) -> None:
+        """Other errors of the hand's sensors have become unknowns."""
+        names = tuple(v.name for v in self._model.variables)
+        if {v.name for v in model.variables}.issuperset(names):
+            precision = np.diag(self._fitter.prior.information)
+            self._detector = self._detector.widened(columns_of(model, names), model.size, 1.0 / precision)
+        else:
+            # What was known with more unknowns is of no use for fewer.
+            self._detector, self._reference = JumpDetector(model.size), None
+            self._moments.run = 0
+        self._model = model
 
     def shift_clock(self, shift: float) -> None:
         """The hand is read later by `shift` (s) from now on."""
@@ -178,8 +190,12 @@ class ChangeWatch:
 
     def _confirmed(self, jump: Jump, settings: DetectorSettings) -> Jump | None:
         """The jump, if it convinces even where errors of the hand's sensors could explain the residuals instead."""
-        _, state, _ = self._before(jump)
-        known = Moment.from_row(self._moments.last(jump.segments + GUARD)[0], self._fitter.long.bank.width)
+        time, state, _ = self._before(jump)
+        older = int(np.searchsorted(self._moments.last_times(self._moments.kept), time, side="right"))
+        if older == 0:
+            return None
+        row = self._moments.last(self._moments.kept)[older - 1]
+        known = Moment.from_row(row, self._fitter.long.bank.width)
         fit = self._fitter.with_sensor_errors(state, known)
         count = jump.segments
         normals = Linearised(fit.model, fit.state).normals(

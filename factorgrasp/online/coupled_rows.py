@@ -6,6 +6,7 @@ The layout is ``[w_r, w_h, dw_h, 1 | f_r, al_r, vech(w_r w_r'), f_h, df_h, 1, (R
 
 from __future__ import annotations
 
+import math
 from collections import deque
 
 import numpy as np
@@ -59,12 +60,7 @@ class HandReader:
         t, x = t[low:high], x[low:high]
         if t.size < 4:
             return np.full((times.size, 6), np.nan)
-        step = self._buffer.step
-        if (
-            times.size > 1
-            and np.all(np.abs(t[1:] - t[:-1] - step) < _UNIFORM * step)
-            and np.isfinite(x).all()
-        ):
+        if times.size > 1 and (t[0] > self._buffer.plain_since or self._plain(t, x)):
             slope = (t[-1] - t[0]) / (t.size - 1)
             first, last = (times[0] - t[0]) / slope, (times[-1] - t[0]) / slope
             if abs((last - first) - (times.size - 1)) < _UNIFORM:
@@ -73,6 +69,10 @@ class HandReader:
             return signals.resample_uniform(t, x, times, max_gap=self._buffer.limit, kind="cubic")[1]
         except InputError:  # fewer than two good samples around
             return np.full((times.size, 6), np.nan)
+
+    def _plain(self, t: FloatArray, x: FloatArray) -> bool:
+        step = self._buffer.step
+        return bool(np.all(np.abs(t[1:] - t[:-1] - step) < _UNIFORM * step) and np.isfinite(x).all())
 
     def release_before(self, time: float) -> None:
         """Let samples go that no time after `time` needs."""
@@ -166,9 +166,9 @@ class Coupler:
         self._starts = True
 
     def _couple(self, t: FloatArray, robot: FloatArray, hand: FloatArray) -> list[Piece]:
-        lost = ~np.isfinite(hand[:, 0])
-        if not lost.any():
+        if math.isfinite(hand[:, 0].sum()):
             return self._average(t, np.hstack([robot, hand]))
+        lost = ~np.isfinite(hand[:, 0])
         out: list[Piece] = []
         for part in np.split(np.arange(t.size), np.flatnonzero(np.diff(lost)) + 1):
             if lost[part[0]]:

@@ -33,6 +33,8 @@ _MARGIN = 1e-9
 _HALF_TURNS = np.array(
     [np.diag(signs) for signs in ((1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, 1.0))]
 )
+# Chances at which errors of the hand's sensors become unknowns, and stop to be.
+_APPEARS, _VANISHES = 1e-4, 1e-2
 # A start that ends lower by this much of the cost (a log likelihood) is better.
 _BETTER = 1.0
 
@@ -112,7 +114,7 @@ class GraspFitter:
         if young:
             self._try_other_starts(level)
         if self._settings.sensor_errors == "auto" and level is self.long:
-            self._add_sensor_errors(level)
+            self._choose_sensor_errors(level)
         self._covariance = None
         self._check = self._checked(level) if self._settings.check_model and level is self.long else None
 
@@ -120,7 +122,7 @@ class GraspFitter:
         """Fit of moments with every error of the hand's sensors that the settings allow as unknown."""
         absent = frozenset(SENSOR_ERRORS) if self._settings.sensor_errors == "never" else frozenset()
         wide = GraspModel(*grasp_variables(self._noise, self._settings, absent))
-        prior = self._widened_prior(wide)
+        prior = self._prior_for(wide)
         return descend(wide, {**prior.mean, **start}, moment, prior, 4, _TOLERANCE)
 
     def shift_clock(self, shift: float) -> None:
@@ -176,28 +178,32 @@ class GraspFitter:
             if other.cost < self.fit.cost - _BETTER:
                 self.fit = descend(self.model, other.state, moment, self.prior, 10)
 
-    def _add_sensor_errors(self, level: Level) -> None:
-        """Errors of the hand's sensors that the data show become unknowns, for good."""
+    def _choose_sensor_errors(self, level: Level) -> None:
+        """Errors of the hand's sensors that the data show become unknowns, and those that turn out to be nothing are none any more."""
         assert self.fit is not None
-        present = {variable.name for variable in self.model.variables}
-        if present.issuperset(SENSOR_ERRORS):
-            return
         moment = level.moment()
         fit = self.with_sensor_errors(self.fit.state, moment)
-        absent = insignificant(fit.model.variables, fit.state, fit.covariance()) - present
-        model = GraspModel(*grasp_variables(self._noise, self._settings, frozenset(absent)))
+        covariance = fit.covariance()
+        present = {variable.name for variable in self.model.variables}
+        # Looked at again and again, chance alone would pass the batch problem's threshold now and then.
+        unproven = insignificant(fit.model.variables, fit.state, covariance, _APPEARS) - present
+        nothing = insignificant(fit.model.variables, fit.state, covariance, _VANISHES) & present
+        model = GraspModel(*grasp_variables(self._noise, self._settings, unproven | nothing))
         if model.size == self.model.size:
             return
-        self.prior = self._widened_prior(model)
+        self.prior = self._prior_for(model)
         self.model = model
         start = {variable.name: fit.state[variable.name] for variable in model.variables}
         self.fit = descend(model, start, moment, self.prior, 10)
 
-    def _widened_prior(self, model: GraspModel) -> GaussianPrior:
+    def _prior_for(self, model: GraspModel) -> GaussianPrior:
+        """The present prior for a model with other sensor errors: new ones at their own prior, dropped ones known to be zero."""
         information = np.diag(prior_precision(model, self._noise, self._grasp_prior))
-        where = columns_of(model, tuple(v.name for v in self.model.variables))
-        information[np.ix_(where, where)] = self.prior.information
-        return GaussianPrior({**self._prior_mean(model), **self.prior.mean}, information)
+        mean = self._prior_mean(model)
+        names = tuple(v.name for v in self.model.variables if v.name in mean)
+        to, source = columns_of(model, names), columns_of(self.model, names)
+        information[np.ix_(to, to)] = self.prior.information[np.ix_(source, source)]
+        return GaussianPrior(mean | {name: self.prior.mean[name] for name in names}, information)
 
     def _checked(self, level: Level) -> ModelCheck:
         assert self.fit is not None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -166,7 +167,7 @@ class OnlineGraspPose:
         rows = [_rows(value, f"robot.{name}", stamps.size, width) for name, value, width in parts]
         if rows[-1].shape[1] == 4:
             rows[-1] = _quaternions(rows[-1], "robot.rotation_wxyz")
-        self._robot.add(stamps, np.hstack(rows))
+        self._robot.add(stamps, _without_infinity(np.hstack(rows), "robot"))
         self._advance()
 
     def add_hand(
@@ -184,7 +185,7 @@ class OnlineGraspPose:
         stamps = _stamps(t, "hand.t")
         rate = _rows(angular_velocity, "hand.angular_velocity", stamps.size, 3)
         force = _rows(specific_force, "hand.specific_force", stamps.size, 3)
-        self._hand.add(stamps, np.hstack([rate, force]))
+        self._hand.add(stamps, _without_infinity(np.hstack([rate, force]), "hand"))
         self._advance()
 
     # ---- answers out -------------------------------------------------------------------------------------
@@ -337,7 +338,7 @@ def _counted(buffer: SampleBuffer, lost: int) -> StreamCounts:
 
 def _stamps(t: npt.ArrayLike, name: str) -> FloatArray:
     out = np.atleast_1d(np.asarray(t, dtype=np.float64))
-    if out.ndim != 1 or not np.isfinite(out).all():
+    if out.ndim != 1 or not math.isfinite(out.sum()):
         raise InputError(
             name, "a finite time stamp or an array of them, shape (m,) [s]", f"shape {out.shape}: {out}"
         )
@@ -353,6 +354,12 @@ def _rows(values: npt.ArrayLike | None, name: str, count: int, width: int) -> Fl
     if out.shape != (count, width):
         raise InputError(name, f"shape ({count}, {width}), one row a time stamp", f"shape {out.shape}")
     return out
+
+
+def _without_infinity(rows: FloatArray, name: str) -> FloatArray:
+    if not math.isfinite(rows.sum()) and np.isinf(rows).any():
+        raise InputError(name, "finite values, or NaN for a gap", "an infinite value")
+    return rows
 
 
 def _quaternions(q: FloatArray, name: str) -> FloatArray:

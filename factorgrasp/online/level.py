@@ -77,7 +77,10 @@ class Level:
 
     def _correct(self) -> None:
         """Expected noise in the weighted sums, for one half-overlapping window."""
-        (w_g, w_a), dof = self.variances.weights, self.bank.windowing.dof
+        self._weights, dof = self.variances.weights, self.bank.windowing.dof
+        w_g, w_a = self._weights
+        self.residuals = float(3.0 * (dof.sum() + dof[self.variances.trusted].sum()))
+        """Independent numbers of one half-overlapping window in the bins that are used."""
         size = float(self._settings.errors_in_variables)
         # The robot's noise acts on the residual through the lever arm: there cannot be more of it than residual power.
         phi = phi_matrix(self._lever_arm)
@@ -88,7 +91,7 @@ class Level:
 
     def moment(self) -> Moment:
         """Weighted sums of all windows."""
-        bank, weights = self.bank, self.variances.weights
+        bank, weights = self.bank, self._weights
         gyro, accelerometer = bank.weighted(weights)
         squared = bank.weighted(weights, squared=True) if bank.squares else (gyro, accelerometer)
         count = bank.weight
@@ -97,7 +100,7 @@ class Level:
     def segment_moments(self, c_g: FloatArray, c_a: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Weighted sums (N, 10, 10) and (N, m, m) of single windows with coefficients (N, K, 2, c), noise not taken out."""
         out = []
-        for c, weight in zip((c_g, c_a), self.variances.weights, strict=True):
+        for c, weight in zip((c_g, c_a), self._weights, strict=True):
             flat = c.reshape(c.shape[0], -1, c.shape[3])
             out.append(np.matmul(flat.transpose(0, 2, 1) * np.repeat(weight, 2), flat))
         return out[0], out[1]
@@ -109,19 +112,13 @@ class Level:
 
     def relative_power(self, sensor: int, power: FloatArray) -> FloatArray:
         """Whitened residual power (N,) of single windows, from their power per bin (N, K), relative to its running median."""
-        total = power @ self.variances.weights[sensor]
+        total = power @ self._weights[sensor]
         for value in total:
             # Stochastic approximation of the median: a step up or down of a few per cent.
             if self._median[sensor] == 0.0:
                 self._median[sensor] = value
             self._median[sensor] *= 1.03 if value > self._median[sensor] else 1.0 / 1.03
         return np.asarray(total / max(self._median[sensor], 1e-300))
-
-    @property
-    def residuals(self) -> float:
-        """Independent numbers of one half-overlapping window in the bins that are used."""
-        dof = self.bank.windowing.dof
-        return float(3.0 * (dof.sum() + dof[self.variances.trusted].sum()))
 
     def refresh(self, fit: Fit, mean_force: FloatArray, rate_moment: FloatArray) -> float:
         """Estimate the residual power of every band anew; returns the largest relative change of a variance."""

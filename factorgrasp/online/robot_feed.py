@@ -196,9 +196,9 @@ class RobotFeed:
         )
         self._refiner = None if finer_step is None else GridInterpolator(finer_step)
 
-    def push(self, t: FloatArray, x: FloatArray) -> list[Piece]:
-        """Pieces of z that settled rows x (m, c) with stamps t (m,) complete."""
-        pieces = self._cutter.cut(t, x)
+    def push(self, t: FloatArray, x: FloatArray, plain: bool = False) -> list[Piece]:
+        """Pieces of z that settled rows x (m, c) with stamps t (m,) complete; `plain`: they are complete and regular."""
+        pieces = self._cutter.cut(t, x, plain)
         if self._regulariser is not None:
             pieces = [out for piece in pieces for out in self._regulariser.push(piece)]
         if self._averager is not None:

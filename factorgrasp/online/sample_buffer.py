@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from factorgrasp.typing import FloatArray
 
 # A step longer than this many nominal steps may be a sample that is still on its way.
 _HOLE = 1.5
+# Steps that differ from the nominal one by less than this part are regular, as in the batch problem.
+_REGULAR = 0.02
 _FIRST_ROWS = 2048
 
 
@@ -33,6 +37,8 @@ class SampleBuffer:
         """Nominal step (s); zero while it is unknown, and nothing is settled."""
         self.limit = np.inf
         """A longer step (s) is a gap."""
+        self.plain_since = np.inf
+        """Settled rows later than this (s) are complete and regular, up to the newest."""
         self.received = self.late = self.duplicates = self.overflown = self.incomplete = self.gaps = 0
         self._t = np.empty(_FIRST_ROWS)
         self._x = np.empty((_FIRST_ROWS, columns))
@@ -75,9 +81,12 @@ class SampleBuffer:
         if not whole:
             self._settle()
             return
-        self._settled, self._frontier = self._end, self._newest
-        if np.isnan(x).any():
+        complete = math.isfinite(x.sum())
+        if not complete:
             self.incomplete += int(np.count_nonzero(np.isnan(x).any(axis=1)))
+        if not complete or most > (1.0 + _REGULAR) * self.step or least < (1.0 - _REGULAR) * self.step:
+            self.plain_since = self._newest
+        self._settled, self._frontier = self._end, self._newest
 
     def settled(self) -> tuple[FloatArray, FloatArray]:
         """Stamps and rows up to the frontier that have not been let go (views)."""
@@ -156,4 +165,4 @@ class SampleBuffer:
         self.incomplete += int(np.count_nonzero(np.isnan(self._x[new]).any(axis=1)))
         self.gaps += int(np.count_nonzero((steps[:count] > self.limit) & np.isfinite(steps[:count])))
         self._settled += count
-        self._frontier = float(t[count - 1])
+        self._frontier = self.plain_since = float(t[count - 1])

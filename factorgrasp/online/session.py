@@ -95,7 +95,7 @@ class GraspSession:
         """Read what has been settled since, once it is about a block."""
         t, x = self._robot.settled()
         if t.size * self._setup.robot.step >= self._least:
-            self.coupler.push(self._feed.push(t, x))
+            self.coupler.push(self._feed.push(t, x, t[0] > self._robot.plain_since))
             self._robot.release(t.size)
         if self.coupler.available(self.offset) + self._setup.master_step >= self._least:
             for piece in self.coupler.pull(self.offset):

@@ -35,10 +35,13 @@ class GapCutter:
         self.limit = limit
         self._last = np.nan
 
-    def cut(self, t: FloatArray, x: FloatArray) -> list[Piece]:
-        """Pieces of the next rows x (m, c) with ascending stamps t (m,)."""
+    def cut(self, t: FloatArray, x: FloatArray, plain: bool = False) -> list[Piece]:
+        """Pieces of the next rows x (m, c) with ascending stamps t (m,); `plain`: known to be complete and without gaps."""
         if t.size == 0:
             return []
+        if plain and t[0] - self._last <= self.limit:
+            self._last = t[-1]
+            return [Piece(t, x, False)]
         first = not t[0] - self._last <= self.limit
         whole = t.size == 1 or bool((t[1:] - t[:-1]).max() <= self.limit)
         if whole and np.isfinite(x).all():

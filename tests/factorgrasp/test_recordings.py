@@ -690,7 +690,9 @@ def test_real_faults_are_found_and_repaired_on_request_only(dataset):
         assert len(read_stream(path, repair=True)) == 7088
     # Its authors interpolated quaternions across changes of sign.
     path = dataset("abb_imu_robot/MPU9150_V_800_Sequencia1.csv")
-    with pytest.warns(UserWarning, match=r"21 quaternion\(s\) shorter than 1 \(down to 0\.\d+\).*taken as gaps"):
+    with pytest.warns(
+        UserWarning, match=r"21 quaternion\(s\) shorter than 1 \(down to 0\.\d+\).*taken as gaps"
+    ):
         assert (~read_poses(path).valid).sum() == 21
     with pytest.warns(UserWarning, match=r"made gaps of 21 quaternion\(s\) whose norm is not 1$"):
         poses = read_poses(path, repair=True)
