@@ -144,6 +144,11 @@ class PinocchioTree:
             self._dofs, tuple(self._fixed_subspaces), 0, not self.floating,
         )  # fmt: skip
 
+    @property
+    def tangent_columns(self) -> IntArray:
+        """(k,) where the components of a :class:`~factorgrasp.problems.link_motion.StateNoise` stand in pinocchio's tangent vector."""
+        return np.concatenate([np.arange(6 if self.floating else 0), self._all_columns]).astype(np.intp)
+
     def motion(self, t: ArrayLike, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike) -> LinkMotion:
         """Link motion of n frames.
 

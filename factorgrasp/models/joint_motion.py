@@ -9,12 +9,13 @@ import numpy as np
 
 from factorgrasp import lie
 from factorgrasp.errors import InputError
+from factorgrasp.models.state_noise import StateNoise
 from factorgrasp.signals import (
     choose_savgol,
     differentiate_rotations,
     savgol_derivatives,
-    savgol_noise_gain,
 )
+from factorgrasp.signals.savgol import savgol_weights
 from factorgrasp.typing import BoolArray, FloatArray
 
 ORDER = 4
@@ -33,6 +34,10 @@ class JointMotion:
         Frames without NaN.
     angle_gain, acceleration_gain : float
         Variance of a smoothed angle and of its second derivative (1/s^4) per variance of one angle: white noise through the filter.
+    cross_gain : float
+        Their covariance (1/s^2), likewise.
+    window : int
+        Samples of the filter: frames so far apart have independent errors.
     """
 
     q: FloatArray
@@ -41,6 +46,12 @@ class JointMotion:
     good: BoolArray
     angle_gain: float
     acceleration_gain: float
+    cross_gain: float = 0.0
+    window: int = 1
+
+    def state_noise(self, covariance: FloatArray) -> StateNoise:
+        """Noise of a motion made of these, from the covariance of one sample of the configuration; see :class:`StateNoise`."""
+        return StateNoise(covariance, self.angle_gain, self.acceleration_gain, self.cross_gain)
 
 
 def differentiate_configurations(model: Any, q: FloatArray, dt: float, bandwidth: float) -> JointMotion:
@@ -88,8 +99,9 @@ def differentiate_configurations(model: Any, q: FloatArray, dt: float, bandwidth
     good: BoolArray = np.asarray(
         np.isfinite(smooth).all(axis=1) & np.isfinite(v).all(axis=1) & np.isfinite(a).all(axis=1)
     )
+    c, second = savgol_weights(window, ORDER, 0, dt), savgol_weights(window, ORDER, 2, dt)
     return JointMotion(
-        smooth, v, a, good, savgol_noise_gain(window, ORDER, 0, dt), savgol_noise_gain(window, ORDER, 2, dt)
+        smooth, v, a, good, float(c @ c), float(second @ second), float(c @ second), window
     )
 
 
