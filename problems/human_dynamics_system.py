@@ -24,7 +24,7 @@ from factorgrasp.problems.human_dynamics_names import (
 from factorgrasp.problems.human_dynamics_rows import SensorRows, sensor_rows
 from factorgrasp.problems.human_dynamics_sensors import Sensor
 from factorgrasp.problems.human_dynamics_settings import HumanDynamicsNoise
-from factorgrasp.problems.human_dynamics_state import on_balance, on_propagation
+from factorgrasp.problems.human_dynamics_state import MotionAcceleration, StateError, on_balance, on_propagation
 from factorgrasp.problems.human_dynamics_terms import MOTION, DynamicsTerms
 from factorgrasp.problems.link_motion import BodyTree, LinkKinematics
 from factorgrasp.problems.link_motion_spatial import centripetal, velocity_wrench
@@ -98,6 +98,7 @@ class HumanDynamicsSystem:
         self.state_errors = state_errors
         self._terms = DynamicsTerms(tree, self.noise, self.contacts, state_errors)
         variables = self._terms.variables()
+        self._judged = [not isinstance(sensor, StateError | MotionAcceleration) for sensor in sensors]
         self._sensor_rows: list[SensorRows] = [sensor_rows(tree, sensor, state_errors) for sensor in sensors]
         names = [rows.name for rows in self._sensor_rows]
         if len(set(names)) != len(names):
@@ -145,7 +146,9 @@ class HumanDynamicsSystem:
             *(self.columns.joint_acceleration[j] for j in self.axes),
         ]
         known = {tuple(group) for group in out}
-        for rows in self._sensor_rows:
+        for rows, judged in zip(self._sensor_rows, self._judged, strict=True):
+            if not judged:
+                continue
             group = self.touched(rows)
             if tuple(group) not in known:
                 known.add(tuple(group))

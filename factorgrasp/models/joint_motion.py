@@ -15,7 +15,6 @@ from factorgrasp.signals import (
     differentiate_rotations,
     savgol_derivatives,
 )
-from factorgrasp.signals.savgol import savgol_weights
 from factorgrasp.typing import BoolArray, FloatArray
 
 ORDER = 4
@@ -46,11 +45,11 @@ class JointMotion:
     good: BoolArray
     angle_gain: float
     acceleration_gain: float
-    cross_gain: float = 0.0
-    window: int = 1
+    cross_gain: float
+    window: int
 
     def state_noise(self, covariance: FloatArray) -> StateNoise:
-        """Noise of a motion made of these, from the covariance of one sample of the configuration; see :class:`StateNoise`."""
+        """Noise of a motion made of these, from the covariance of one sample of the configuration."""
         return StateNoise(covariance, self.angle_gain, self.acceleration_gain, self.cross_gain)
 
 
@@ -99,10 +98,9 @@ def differentiate_configurations(model: Any, q: FloatArray, dt: float, bandwidth
     good: BoolArray = np.asarray(
         np.isfinite(smooth).all(axis=1) & np.isfinite(v).all(axis=1) & np.isfinite(a).all(axis=1)
     )
-    c, second = savgol_weights(window, ORDER, 0, dt), savgol_weights(window, ORDER, 2, dt)
-    return JointMotion(
-        smooth, v, a, good, float(c @ c), float(second @ second), float(c @ second), window
-    )
+    passed = StateNoise.through_savgol(np.ones(1), window, ORDER, dt)
+    gains = passed.position_gain, passed.acceleration_gain, passed.cross_gain
+    return JointMotion(smooth, v, a, good, *gains, window)
 
 
 def free_flyer(

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from factorgrasp.human_dynamics_payload import contact_rows, payload_of, solve_with_contacts
+from factorgrasp.human_dynamics_payload import contact_rows, payload_of
 from factorgrasp.problems.human_dynamics import HumanDynamics
 from factorgrasp.problems.human_dynamics_sensors import Sensor
 from factorgrasp.problems.human_dynamics_settings import HumanDynamicsNoise
@@ -22,7 +22,7 @@ from factorgrasp.solvers.frames import FrameSolver
 from factorgrasp.typing import BoolArray, FloatArray, IntArray
 from factorgrasp.uncertainty import nees_band
 
-EXACT_MODEL = 1e-8
+EXACT_MODEL = 1e-10
 """Variance of a model that makes no errors, as the simulated one: what is tested is what noise of sensors does."""
 HAND = (1e4, 1e4, 1e4, 1e-6, 1e-6, 1e-6)
 """Of a hand's wrench about where it holds: any force, no moment."""
@@ -71,6 +71,7 @@ class Errors:
     torque, wrench, payload : ndarray
         (n,) NEES of a frame: of all torques together, of the measured and unmeasured wrenches together, and of the payload.
     torque_dof, wrench_dof : int
+        Of all frames together.
     mass_error : ndarray
         (n,) kg, empty without a payload.
     """
@@ -107,8 +108,8 @@ def errors_of(
     motion, keep, own = recording.measured_motion
     frames = np.arange(offset, len(motion), recording.filter_window)
     part = motion.select(frames)
-    if not state_noise:
-        part = part.with_state_noise(None)
+    if state_noise:
+        part = part.with_state_noise(recording.state_noise)
     at = np.flatnonzero(keep)[frames]
     noise = replace(own, propagation=EXACT_MODEL, balance=EXACT_MODEL, free_wrench=1e-10, contact_wrench=HAND)
     sensors: list[Sensor] = [*recording.foot_sensors(part, at, unloaded=1e-6)]
@@ -118,37 +119,59 @@ def errors_of(
     points = {link: recording.body.segments[link].com for link in hands}
     contacts = [contact_rows(part, noise, tuple(hands), points)] if hands else []
     problem = HumanDynamics(part, [*sensors, *contacts], noise)
-    x, P, groups, nearer = joint_covariances(problem, [problem.system.columns.external_wrench[part.link(link)] for link in links])
+    columns = problem.system.columns
+    wrenches = np.concatenate([columns.external_wrench[part.link(link)] for link in links])
+    held = [columns.external_wrench[part.link(link)] for link in hands]
+    held += [columns.acceleration[part.link(link)] for link in hands]
+    x, P, groups, nearer = _solved(problem, [wrenches, *([np.concatenate(held)] if hands else [])])
+    fit = _told(part.R[:, [part.link(link) for link in hands]])
     torque, reader = _torques(nearer, x)
     true = recording.truth.of(part.dof_names)[at]
     where = groups[0]
     C = reader[:, :, where] @ P[0] @ np.swapaxes(reader[:, :, where], 1, 2)
     blank = np.zeros((len(recording.t), 6))
     wrench = np.concatenate([recording.truth.external_wrench.get(link, blank)[at] for link in links], axis=1)
+    error, C_wrench = (fit @ (x[:, groups[1]] - wrench)[..., None])[..., 0], fit @ P[1] @ np.swapaxes(fit, 1, 2)
+    # A plate that nobody stands on is exactly zero here: nothing to judge.
+    told = np.ones(error.shape, dtype=bool)
+    for i, link in enumerate(FEET):
+        told[:, 6 * i : 6 * i + 6] = np.any(recording.plates[link].force[at], axis=1)[:, None]
+    error = np.where(told, error, 0.0)
+    C_wrench = np.where(told[:, :, None] & told[:, None, :], C_wrench, np.eye(error.shape[1]))
     payload, mass_error = np.empty(0), np.empty(0)
     if hands:
-        _, y, Q = solve_with_contacts(problem, None, tuple(hands))
-        load = payload_of(part, noise, tuple(hands), tuple(hands), y, Q, points)
+        load = payload_of(part, noise, tuple(hands), tuple(hands), x[:, groups[2]], P[2], points)
         mass_error = load.mass - recording.truth.payload
         payload = (mass_error / load.mass_sd) ** 2
     return Errors(
-        _nees(torque - true, C), _nees(x[:, groups[1]] - wrench, P[1]), payload, true.shape[1], wrench.shape[1], mass_error
+        _nees(torque - true, C), _nees(error, C_wrench), payload, true.size, int(told.sum()), mass_error
     )
 
 
-def joint_covariances(
+def _told(R_hands: FloatArray) -> FloatArray:
+    """Read-out (n, 12 or 15, 12 + 6 k) of what the data tell: the feet's wrenches and the sum of the hands' forces in the world.
+
+    The hands' moments are what the prior says, and how two hands share a load as well.
+    """
+    count, hands = R_hands.shape[:2]
+    out = np.zeros((count, 12 + 3 * (hands > 0), 12 + 6 * hands))
+    out[:, :12, :12] = np.eye(12)
+    for k in range(hands):
+        out[:, 12:, 12 + 6 * k : 15 + 6 * k] = R_hands[:, k]
+    return out
+
+
+def _solved(
     problem: HumanDynamics, wanted: Sequence[IntArray]
 ) -> tuple[FloatArray, list[FloatArray], list[IntArray], HumanDynamics]:
-    """Unknowns, and joint covariances of all joint wrenches (with what turns their axes) and of the wanted ones together."""
-    system = problem.system
+    """Unknowns, and joint covariances of all joint wrenches (with what turns their axes) and of the wanted groups."""
+    system, every = problem.system, slice(0, len(problem))
     turns = [group[6:] for group in system.turning.values()]
-    groups = [np.concatenate([system.columns.joint_wrench.ravel(), *turns]), np.concatenate(wanted)]
-    solver, every = FrameSolver(problem.pattern, groups), slice(0, len(problem))
-    result = solver.solve(*problem.whitened_frames(every))
-    nearer = problem.relinearised(result.x)
-    if nearer is not None:
-        problem, result = nearer, solver.solve(*nearer.whitened_frames(every))
-    return result.x, [np.asarray(block) for block in result.marginals], groups, problem
+    groups = [np.concatenate([system.columns.joint_wrench.ravel(), *turns]), *wanted]
+    solver = FrameSolver(problem.pattern, groups)
+    nearer = problem.relinearised(solver.solve(*problem.whitened_frames(every), covariance=False).x) or problem
+    result = solver.solve(*nearer.whitened_frames(every))
+    return result.x, [np.asarray(block) for block in result.marginals], groups, nearer
 
 
 def monte_carlo(
@@ -161,17 +184,16 @@ def monte_carlo(
     """NEES of torques, wrenches and, with hands, the payload over seeds."""
     found = [errors_of(make(seed), hands, imus, state_noise) for seed in seeds]
     out = {
-        "torques": _total("torques", [e.torque for e in found], found[0].torque_dof),
-        "wrenches": _total("wrenches", [e.wrench for e in found], found[0].wrench_dof),
+        "torques": Consistency("torques", _sum(e.torque for e in found), sum(e.torque_dof for e in found)),
+        "wrenches": Consistency("wrenches", _sum(e.wrench for e in found), sum(e.wrench_dof for e in found)),
     }
     if hands:
-        out["payload"] = _total("payload", [e.payload for e in found], 1)
+        out["payload"] = Consistency("payload", _sum(e.payload for e in found), sum(e.payload.size for e in found))
     return out
 
 
-def _total(name: str, nees: Sequence[FloatArray], dof: int) -> Consistency:
-    every = np.concatenate(nees)
-    return Consistency(name, float(every.sum()), dof * every.size)
+def _sum(parts: Iterable[FloatArray]) -> float:
+    return float(sum(part.sum() for part in parts))
 
 
 def _torques(problem: HumanDynamics, x: FloatArray) -> tuple[FloatArray, FloatArray]:

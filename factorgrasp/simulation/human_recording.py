@@ -13,7 +13,7 @@ from factorgrasp.models.human import HumanBody
 from factorgrasp.models.joint_motion import ORDER, differentiate_configurations
 from factorgrasp.problems.human_dynamics_sensors import Accelerometer, ExternalWrench, Sensor, plate_wrench
 from factorgrasp.problems.human_dynamics_settings import HumanDynamicsNoise
-from factorgrasp.problems.link_motion import LinkMotion
+from factorgrasp.problems.link_motion import LinkMotion, StateNoise
 from factorgrasp.problems.link_motion_pinocchio import PinocchioTree
 from factorgrasp.problems.link_motion_spatial import rotate_back
 from factorgrasp.recordings.forces import ForceRecording
@@ -153,12 +153,8 @@ class HumanRecording:
         model = self.body.model()
         found = differentiate_configurations(model, self.configurations, 1.0 / RATE, self.noise.bandwidth)
         keep = found.good
-        tree = PinocchioTree(model)
-        motion = tree.motion(self.t[keep], found.q[keep], found.qd[keep], found.qdd[keep])
+        motion = PinocchioTree(model).motion(self.t[keep], found.q[keep], found.qd[keep], found.qdd[keep])
         n, gain = self.noise, found.acceleration_gain
-        if min(n.angle, n.position, n.orientation) > 0.0:
-            sd = np.array([n.position] * 3 + [n.orientation] * 3 + [n.angle] * (model.nv - 6))
-            motion = motion.with_state_noise(found.state_noise(sd[tree.tangent_columns] ** 2))
         root = [n.position**2 * gain] * 3 + [n.orientation**2 * gain] * 3
         variances = HumanDynamicsNoise(
             joint_acceleration=max(n.angle**2 * gain, 1e-12), link_acceleration=np.maximum(root, 1e-12)
@@ -183,6 +179,13 @@ class HumanRecording:
             point = np.column_stack([-about[:, 1] / safe, about[:, 0] / safe, np.zeros(len(f))])
             out[link] = ForceRecording(self.t, f, point, about - np.cross(point, f), link)
         return out
+
+    @cached_property
+    def state_noise(self) -> StateNoise:
+        """Noise of the configurations of :attr:`measured_motion`, for its ``with_state_noise``."""
+        n, tree = self.noise, PinocchioTree(self.body.model())
+        sd = np.array([n.position] * 3 + [n.orientation] * 3 + [n.angle] * (tree.model.nv - 6))
+        return StateNoise.through_savgol(sd[tree.tangent_columns] ** 2, self.filter_window, ORDER, 1.0 / RATE)
 
     @property
     def filter_window(self) -> int:
