@@ -7,8 +7,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.ndimage import median_filter
 
 from factorgrasp.least_squares import LeastSquares
+from factorgrasp.problems.external_wrenches_estimate import ratio_bias
 from factorgrasp.problems.human_dynamics import HumanDynamics
 from factorgrasp.problems.human_dynamics_estimate import HumanDynamicsEstimate
 from factorgrasp.problems.human_dynamics_sensors import WrenchSet
@@ -17,6 +19,8 @@ from factorgrasp.problems.link_motion import LinkMotion
 from factorgrasp.problems.link_motion_spatial import rotate, skew
 from factorgrasp.typing import BoolArray, FloatArray, IntArray
 
+SMOOTHED = 101
+"""Frames over which the weights of a mean are smoothed: longer than errors of accelerations last."""
 CONTACTS = "unmeasured contacts"
 
 
@@ -163,9 +167,12 @@ def payload_of(
 
     Notes
     -----
-    On hands with the acceleration a, an object of mass m pulls with ``F = m u``, ``u = g - a``, so that ``m = F' u / u' u``. Both F and u are
-    estimates with errors that go with each other: an acceleration that is wrong by e changes F by the mass of all that moves with it times e.
-    Their joint covariance gives the variance of m, and its second-order bias, which is taken out. The posterior of F holds a zero-mean prior
+    On hands with the acceleration a, an object of mass m pulls with ``F = m u``, ``u = g - a``, so that ``m = F' u /
+    u' u``. Both F and u are
+    estimates with errors that go with each other: an acceleration that is wrong by e changes F by the mass of all
+    that moves with it times e.
+    Their joint covariance gives the variance of m, and its second-order bias, which is taken out. The posterior of F
+    holds a zero-mean prior
     (the noise's `contact_wrench` and `prior_external_wrench`), which draws masses towards zero. It is taken out, too: with the posterior
     ``N(mu, P)`` and the prior's information ``L0`` the data alone say ``(P^-1 - L0)^-1 P^-1 mu``. Weighting the components of F by their
     covariance would use them better if u were exact; with the noise of a, the well-known horizontal ones bias the mass by several per cent.
@@ -213,7 +220,8 @@ def payload_of(
     sd = np.sqrt(variance)
     if not known.any():
         return Payload(links, mass, sd, float("nan"), float("nan"))
-    weight = 1.0 / variance[known]
+    # Variances hold the frame's own F and u: with weights from them, frames whose error is upwards would count for less.
+    weight = 1.0 / median_filter(variance[known], SMOOTHED, mode="nearest")
     mean = float(np.sum(weight * mass[known]) / weight.sum())
     return Payload(links, mass, sd, mean, float(np.nanmedian(sd)))
 
@@ -231,7 +239,4 @@ def _ratio(
         return np.asarray(np.einsum("ni,nij,nj->n", a, C, b))
 
     variance = form(by_F, C_FF, by_F) + 2.0 * form(by_u, C_uF, by_F) + form(by_u, C_uu, by_u)
-    trace = np.trace(C_uF, axis1=1, axis2=2) / square - 2.0 * form(u, C_uF, u) / square**2
-    bend = -2.0 * form(F, C_uu, u) / square**2 + 4.0 * m * form(u, C_uu, u) / square**2
-    bend -= m * np.trace(C_uu, axis1=1, axis2=2) / square
-    return m - (trace + bend), variance
+    return m - ratio_bias(F, u, C_uF, C_uu), variance

@@ -108,8 +108,10 @@ class HumanDynamics:
         """
         if self._measured_all:
             return None
-        out, columns, good = copy(self), self.system.columns, np.isfinite(x).all(axis=1)[:, None, None]
-        k, count = self._kinematics, x.shape[0]
+        out, columns, k, count = copy(self), self.system.columns, self._kinematics, x.shape[0]
+        assert k.external_wrench is not None
+        assert k.joint_wrench is not None
+        good = np.asarray(np.isfinite(x).all(axis=1)).reshape(-1, 1, 1)
         external = x[:, columns.external_wrench.ravel()].reshape(count, -1, 6)
         joint = x[:, columns.joint_wrench.ravel()].reshape(count, -1, 6)
         out._linearise(np.where(good, external, k.external_wrench), np.where(good, joint, k.joint_wrench))

@@ -116,7 +116,9 @@ class HumanDynamicsEstimate:
 
 
 def _by_group(groups: Sequence[IntArray], blocks: Sequence[FloatArray]) -> dict[tuple[int, ...], FloatArray]:
-    return {tuple(map(int, group)): block for group, block in zip(groups, blocks, strict=True)} if blocks else {}
+    return (
+        {tuple(map(int, group)): block for group, block in zip(groups, blocks, strict=True)} if blocks else {}
+    )
 
 
 def read_frames(problem: HumanDynamics, result: Any) -> HumanDynamicsEstimate:

@@ -22,7 +22,11 @@ def newton_euler(tree: BodyTree, k: LinkKinematics, external: FloatArray) -> tup
     external : ndarray
         (n, L, 6) net external wrenches in the links' frames.
     """
-    net = (tree.spatial_inertia @ k.acceleration[..., None])[..., 0] - velocity_wrench(tree.spatial_inertia, k.velocity) - external
+    net = (
+        (tree.spatial_inertia @ k.acceleration[..., None])[..., 0]
+        - velocity_wrench(tree.spatial_inertia, k.velocity)
+        - external
+    )
     f = np.zeros((k.count, len(tree.joints), 6))
     for j in tree.from_leaves:
         f[:, j] = net[:, tree.children[j]]

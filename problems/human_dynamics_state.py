@@ -244,4 +244,3 @@ def torque_turn(S: FloatArray, f: FloatArray) -> FloatArray:
     # T[m, k] = -(S_k x S_m)' f for k behind m.
     turned = cross_motion(columns[:, None, :], columns[:, :, None])
     return np.asarray(-np.einsum("nmki,ni->nmk", turned, f) * np.triu(np.ones((size, size)), 1))
-

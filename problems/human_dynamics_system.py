@@ -24,7 +24,12 @@ from factorgrasp.problems.human_dynamics_names import (
 from factorgrasp.problems.human_dynamics_rows import SensorRows, sensor_rows
 from factorgrasp.problems.human_dynamics_sensors import Sensor
 from factorgrasp.problems.human_dynamics_settings import HumanDynamicsNoise
-from factorgrasp.problems.human_dynamics_state import MotionAcceleration, StateError, on_balance, on_propagation
+from factorgrasp.problems.human_dynamics_state import (
+    MotionAcceleration,
+    StateError,
+    on_balance,
+    on_propagation,
+)
 from factorgrasp.problems.human_dynamics_terms import MOTION, DynamicsTerms
 from factorgrasp.problems.link_motion import BodyTree, LinkKinematics
 from factorgrasp.problems.link_motion_spatial import centripetal, velocity_wrench

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from factorgrasp.errors import InputError
-from factorgrasp.problems.link_motion_check import check_masses, check_names, check_rotations, check_tree
 from factorgrasp.models.state_noise import StateNoise
+from factorgrasp.problems.link_motion_check import check_masses, check_names, check_rotations, check_tree
 from factorgrasp.problems.link_motion_parts import BodyTree, LinkJoint, LinkKinematics
 from factorgrasp.problems.link_motion_spatial import (
     cross_motion,
@@ -29,7 +29,15 @@ from factorgrasp.problems.link_motion_spatial import (
 )
 from factorgrasp.typing import BoolArray, FloatArray, IntArray
 
-__all__ = ["GRAVITY", "BodyTree", "LinkJoint", "LinkKinematics", "LinkMotion", "StateNoise", "spherical_subspace"]
+__all__ = [
+    "GRAVITY",
+    "BodyTree",
+    "LinkJoint",
+    "LinkKinematics",
+    "LinkMotion",
+    "StateNoise",
+    "spherical_subspace",
+]
 
 GRAVITY = (0.0, 0.0, -9.80665)
 

@@ -159,7 +159,9 @@ class BodyTree:
         order: list[int] = []
         left = set(range(len(self.joints)))
         while left:
-            ready = [j for j in sorted(left) if not any(self.parents[other] == self.children[j] for other in left)]
+            ready = [
+                j for j in sorted(left) if not any(self.parents[other] == self.children[j] for other in left)
+            ]
             order += ready
             left -= set(ready)
         return tuple(order)

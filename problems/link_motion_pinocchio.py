@@ -355,7 +355,7 @@ class _JointKind:
         elif name in ("RevoluteUnaligned", "RevoluteUnboundedUnaligned", "PrismaticUnaligned"):
             # Through the data: the bindings offer the axis of the generic joint under no name.
             data = joint.createData()
-            joint.calc(data, _neutral(model), np.zeros(model.nv))
+            joint.calc(data, neutral(model), np.zeros(model.nv))
             column = np.asarray(data.S).ravel()
             prismatic = name == "PrismaticUnaligned"
             self.axis = column[:3] if prismatic else column[3:]
@@ -437,7 +437,8 @@ def _check_quaternions(q: FloatArray) -> FloatArray:
     return np.asarray(norm)
 
 
-def _neutral(model: Any) -> FloatArray:
+def neutral(model: Any) -> FloatArray:
+    """The configuration (nq,) with all joints at zero."""
     import pinocchio as pin
 
     return np.asarray(pin.neutral(model))

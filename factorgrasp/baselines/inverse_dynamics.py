@@ -11,10 +11,10 @@ from numpy.typing import ArrayLike
 
 from factorgrasp.errors import InputError
 from factorgrasp.problems.human_dynamics import HumanDynamics
+from factorgrasp.problems.human_dynamics_point import newton_euler
 from factorgrasp.problems.human_dynamics_sensors import Sensor
 from factorgrasp.problems.human_dynamics_settings import HumanDynamicsNoise
 from factorgrasp.problems.link_motion import LinkMotion
-from factorgrasp.problems.human_dynamics_point import newton_euler
 from factorgrasp.problems.link_motion_spatial import rotate_back, skew
 from factorgrasp.typing import FloatArray
 

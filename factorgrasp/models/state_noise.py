@@ -41,7 +41,11 @@ class StateNoise:
         C = np.asarray(self.covariance, dtype=float)
         object.__setattr__(self, "covariance", C)
         if C.ndim not in (1, 2, 3) or not C.size or not np.all(np.isfinite(C)):
-            raise InputError("covariance of the state", "finite, of shape (k,), (k, k), (n, k) or (n, k, k)", f"shape {C.shape}")
+            raise InputError(
+                "covariance of the state",
+                "finite, of shape (k,), (k, k), (n, k) or (n, k, k)",
+                f"shape {C.shape}",
+            )
         if not self.position_gain > 0.0 or self.acceleration_gain < 0.0:
             raise InputError(
                 "gains of the state's noise", "position gain above zero, acceleration gain of at least zero",
@@ -61,7 +65,9 @@ class StateNoise:
     @property
     def full(self) -> bool:
         """Whether components are correlated."""
-        return self.covariance.ndim == 3 or (self.covariance.ndim == 2 and self.covariance.shape[0] == self.size)
+        return self.covariance.ndim == 3 or (
+            self.covariance.ndim == 2 and self.covariance.shape[0] == self.size
+        )
 
     @property
     def varies(self) -> bool:
@@ -95,7 +101,11 @@ class StateNoise:
             )  # fmt: skip
         lowest = np.linalg.eigvalsh(self.covariance).min() if self.full else self.covariance.min()
         if lowest <= 0.0:
-            raise InputError("state noise of the motion", "a positive definite covariance", f"smallest variance {lowest:.3g}")
+            raise InputError(
+                "state noise of the motion",
+                "a positive definite covariance",
+                f"smallest variance {lowest:.3g}",
+            )
 
     @classmethod
     def through_savgol(cls, covariance: FloatArray, window: int, order: int, dt: float) -> StateNoise:

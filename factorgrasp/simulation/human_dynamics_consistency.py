@@ -1,6 +1,7 @@
 """Do the stated covariances of human dynamics hold? Normalised errors (NEES) against known truth, over seeds, in independent frames.
 
-Errors of one frame are Gaussian with the joint covariance of all torques (or of all external wrenches that are not known to be zero), so that the
+Errors of one frame are Gaussian with the joint covariance of all torques (or of all external wrenches that are not
+known to be zero), so that the
 sum of ``e' P^-1 e`` over frames whose noise is independent is chi-square: frames of one recording are taken a filter's window apart.
 """
 
@@ -14,7 +15,6 @@ import numpy as np
 from factorgrasp.human_dynamics_payload import contact_rows, payload_of
 from factorgrasp.problems.human_dynamics import HumanDynamics
 from factorgrasp.problems.human_dynamics_sensors import Sensor
-from factorgrasp.problems.human_dynamics_settings import HumanDynamicsNoise
 from factorgrasp.problems.human_dynamics_state import torque_turn
 from factorgrasp.simulation.human_dynamics import FEET
 from factorgrasp.simulation.human_recording import HumanRecording
@@ -24,7 +24,8 @@ from factorgrasp.uncertainty import nees_band
 
 EXACT_MODEL = 1e-10
 """Variance of a model that makes no errors, as the simulated one: what is tested is what noise of sensors does."""
-HAND = (1e4, 1e4, 1e4, 1e-6, 1e-6, 1e-6)
+ARMS = ("Shoulder", "Elbow", "Wrist")
+HAND = (1e4, 1e4, 1e4, 1e-8, 1e-8, 1e-8)
 """Of a hand's wrench about where it holds: any force, no moment."""
 
 
@@ -125,13 +126,19 @@ def errors_of(
     held += [columns.acceleration[part.link(link)] for link in hands]
     x, P, groups, nearer = _solved(problem, [wrenches, *([np.concatenate(held)] if hands else [])])
     fit = _told(part.R[:, [part.link(link) for link in hands]])
-    torque, reader = _torques(nearer, x)
-    true = recording.truth.of(part.dof_names)[at]
+    # How two hands share a load is the prior's, and with it the torques of the arms.
+    names = [n for n in part.dof_names if len(hands) < 2 or not any(joint in n for joint in ARMS)]
+    chosen = [part.dof_names.index(name) for name in names]
+    torque, reader = (shown[:, chosen] for shown in _torques(nearer, x))
+    true = recording.truth.of(names)[at]
     where = groups[0]
     C = reader[:, :, where] @ P[0] @ np.swapaxes(reader[:, :, where], 1, 2)
     blank = np.zeros((len(recording.t), 6))
     wrench = np.concatenate([recording.truth.external_wrench.get(link, blank)[at] for link in links], axis=1)
-    error, C_wrench = (fit @ (x[:, groups[1]] - wrench)[..., None])[..., 0], fit @ P[1] @ np.swapaxes(fit, 1, 2)
+    error, C_wrench = (
+        (fit @ (x[:, groups[1]] - wrench)[..., None])[..., 0],
+        fit @ P[1] @ np.swapaxes(fit, 1, 2),
+    )
     # A plate that nobody stands on is exactly zero here: nothing to judge.
     told = np.ones(error.shape, dtype=bool)
     for i, link in enumerate(FEET):
@@ -169,7 +176,9 @@ def _solved(
     turns = [group[6:] for group in system.turning.values()]
     groups = [np.concatenate([system.columns.joint_wrench.ravel(), *turns]), *wanted]
     solver = FrameSolver(problem.pattern, groups)
-    nearer = problem.relinearised(solver.solve(*problem.whitened_frames(every), covariance=False).x) or problem
+    nearer = (
+        problem.relinearised(solver.solve(*problem.whitened_frames(every), covariance=False).x) or problem
+    )
     result = solver.solve(*nearer.whitened_frames(every))
     return result.x, [np.asarray(block) for block in result.marginals], groups, nearer
 
@@ -188,7 +197,9 @@ def monte_carlo(
         "wrenches": Consistency("wrenches", _sum(e.wrench for e in found), sum(e.wrench_dof for e in found)),
     }
     if hands:
-        out["payload"] = Consistency("payload", _sum(e.payload for e in found), sum(e.payload.size for e in found))
+        out["payload"] = Consistency(
+            "payload", _sum(e.payload for e in found), sum(e.payload.size for e in found)
+        )
     return out
 
 
@@ -220,4 +231,6 @@ def _nees(error: FloatArray, C: FloatArray) -> FloatArray:
     correlation = C * scale[:, :, None] * scale[:, None, :]
     z = error * scale
     good: BoolArray = np.asarray(np.isfinite(z).all(axis=1))
-    return np.asarray(np.einsum("ni,ni->n", z[good], np.linalg.solve(correlation[good], z[good][..., None])[..., 0]))
+    return np.asarray(
+        np.einsum("ni,ni->n", z[good], np.linalg.solve(correlation[good], z[good][..., None])[..., 0])
+    )

@@ -17,10 +17,10 @@ from factorgrasp.problems.link_motion import LinkMotion, StateNoise
 from factorgrasp.problems.link_motion_pinocchio import PinocchioTree
 from factorgrasp.problems.link_motion_spatial import rotate_back
 from factorgrasp.recordings.forces import ForceRecording
+from factorgrasp.signals import choose_savgol
 from factorgrasp.simulation.human_motion import (
     JointTrajectory,
 )
-from factorgrasp.signals import choose_savgol
 from factorgrasp.typing import BoolArray, FloatArray, IntArray
 
 RATE = 100.0
@@ -226,7 +226,9 @@ class HumanRecording:
             out.append(ExternalWrench(values[keep], sd**2, f"force sensor at {link}", link=link))
         return out
 
-    def imus(self, keep: BoolArray | IntArray | slice = slice(None), links: Sequence[str] = IMU_LINKS) -> list[Sensor]:
+    def imus(
+        self, keep: BoolArray | IntArray | slice = slice(None), links: Sequence[str] = IMU_LINKS
+    ) -> list[Sensor]:
         """Accelerometers at the centres of mass of links, in their axes."""
         rng = np.random.default_rng([self.seed, 4])
         out: list[Sensor] = []

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
 
 from factorgrasp.errors import InputError
+from factorgrasp.online.human_dynamics import OnlineHumanDynamics
+from factorgrasp.problems.external_wrenches import ExternalWrenches
 from factorgrasp.problems.human_dynamics import HumanDynamics
 from factorgrasp.problems.human_dynamics_names import (
     acceleration_of,
     joint_acceleration_of,
-    pose_error_of,
     wrench_of,
     wrench_on,
 )
@@ -22,8 +25,11 @@ from factorgrasp.problems.human_dynamics_settings import HumanDynamicsNoise
 from factorgrasp.problems.human_dynamics_state import holders
 from factorgrasp.problems.link_motion import StateNoise
 from factorgrasp.problems.link_motion_pinocchio import PinocchioTree
+from factorgrasp.simulation.human_dynamics import HumanNoise, human_carrying, human_tpose
+from factorgrasp.simulation.human_dynamics_consistency import monte_carlo
 from factorgrasp.solvers.frames import solve_frames
 from factorgrasp.typing import FloatArray
+from factorgrasp.uncertainty import nees_band
 
 from .human_dynamics_body import body, random_states, random_wrenches
 
@@ -66,7 +72,10 @@ def displaced(size: float, floating: bool) -> tuple[FloatArray, FloatArray]:
     external[:, truth.root] = residual
     sensors = [
         ExternalWrench(
-            world_wrench(truth, link, external[:, truth.link(link)], motion.p[:, truth.link(link)]), 1.0, link=link, frame="world"
+            world_wrench(truth, link, external[:, truth.link(link)], motion.p[:, truth.link(link)]),
+            1.0,
+            link=link,
+            frame="world",
         )
         for link in (*links, truth.links[truth.root])
     ]
@@ -94,7 +103,11 @@ def displaced(size: float, floating: bool) -> tuple[FloatArray, FloatArray]:
                 put(joint_acceleration_of(joint.name), k.joint_acceleration[n, ends[j] : ends[j + 1]])
             for name, at in holders(truth.tree):
                 put(name, error[n, at])
-            names = [name for name in system.terms if name.startswith(("propagation", "balance", "acceleration of", "external wrench"))]
+            names = [
+                name
+                for name in system.terms
+                if name.startswith(("propagation", "balance", "acceleration of", "external wrench"))
+            ]
             assert len(names) == 2 * len(truth.links) + 4
             r = system.jacobian.matrix @ x - system.jacobian.rhs
             rows.append(np.concatenate([r[system.jacobian.slices[name]] for name in names]))
@@ -109,3 +122,111 @@ def test_rows_are_right_to_first_order(floating: bool) -> None:
     blind = displaced(1e-4, floating)[1]
     assert np.abs(small).max() < 2e-2 * np.abs(big).max()
     assert np.abs(small).max() < 1e-2 * np.abs(blind).max()
+
+
+@pytest.mark.parametrize(
+    ("make", "hands", "seeds"),
+    [
+        (human_tpose, (), 1),
+        (partial(human_tpose, payload=5.0), ("RightHand",), 1),
+        (partial(human_carrying, motion="walking", payload=0.0, noise=HumanNoise(bandwidth=9.0)), (), 1),
+    ],
+)
+def test_consistent_over_seeds(make: Any, hands: tuple[str, ...], seeds: int) -> None:
+    """All torques together, wrenches, and a payload inside the 95 % band of independent frames; with poses taken to
+    be exact, torques are not."""
+    found = monte_carlo(make, range(seeds), hands)
+    for one in found.values():
+        assert one.inside, (one.name, one.ratio, one.band)
+    assert found["torques"].dof > 1500
+    assert monte_carlo(make, range(1), hands, state_noise=False)["torques"].ratio > 1.5
+
+
+def test_wrenches_by_momentum_are_consistent() -> None:
+    """The two-task estimate: feet, what the hand carries and the payload inside their bands."""
+    wrench, payload, plain = [], [], []
+    for seed in range(5):
+        recording = human_tpose(seed, payload=5.0)
+        motion, keep, own = recording.measured_motion
+        frames = np.arange(0, len(motion), recording.filter_window)
+        at, part = np.flatnonzero(keep)[frames], motion.select(frames)
+        sensors = recording.foot_sensors(part, at)
+        noise = replace(own, free_wrench=1e-8, contact_wrench=(1e4, 1e4, 1e4, 1e2, 1e2, 1e2))
+        links = ("RightFoot", "LeftFoot", "RightHand")
+        truth = np.concatenate([recording.truth.external_wrench[link][at] for link in links], axis=1)
+        for moving in (part.with_state_noise(recording.state_noise), part):
+            found = ExternalWrenches(moving, sensors, ("RightHand",), noise).estimate()
+            # The hand's moment is mostly the prior's.
+            e = (np.concatenate([found.of(link) for link in links], axis=1) - truth)[:, :15]
+            P = found.joint_covariance(links)[:, :15, :15]
+            load = found.payload()
+            if moving is part:
+                plain.append(((load.mass - 5.0) / load.sd) ** 2)
+                continue
+            wrench.append(np.einsum("ni,ni->n", e, np.linalg.solve(P, e[..., None])[..., 0]))
+            payload.append(((load.mass - 5.0) / load.sd) ** 2)
+    scores = np.concatenate(wrench)
+    low, high = nees_band(15, scores.size)
+    assert low < scores.mean() / 15.0 < high
+    scores = np.concatenate(payload)
+    low, high = nees_band(1, scores.size)
+    assert low < scores.mean() < high
+    assert np.concatenate(plain).mean() > 2.0
+
+
+def test_covariances_of_a_state_may_be_full_and_vary() -> None:
+    """A full covariance that is diagonal, and one a frame, give the same as variances; a correlated one does not."""
+    recording = human_tpose()
+    motion, keep, own = recording.measured_motion
+    part, at = motion.select(np.arange(4)), np.flatnonzero(keep)[:4]
+    noise, sensors = recording.state_noise, recording.foot_sensors(part, at)
+    k = noise.size
+    mixed = np.diag(noise.covariance)
+    mixed[0, 4] = mixed[4, 0] = 0.8 * np.sqrt(mixed[0, 0] * mixed[4, 4])
+    shapes = (
+        noise.covariance,
+        np.diag(noise.covariance),
+        np.tile(noise.covariance, (4, 1)),
+        np.tile(np.diag(noise.covariance), (4, 1, 1)),
+    )
+    sd = [
+        solve_frames(
+            HumanDynamics(part.with_state_noise(replace(noise, covariance=C)), sensors, own)
+        ).torque_sd
+        for C in (*shapes, mixed)
+    ]
+    for other in sd[1:4]:
+        assert np.allclose(other, sd[0], rtol=1e-6)
+    assert np.abs(sd[4] / sd[0] - 1.0).max() > 1e-3
+    assert part.with_state_noise(noise).select([1, 2]).state_noise is noise
+    for bad, words in (
+        (np.ones(k - 1), f"{k} components"),
+        (-np.ones(k), "positive definite"),
+        (np.ones((7, k)), "4 frames"),
+    ):
+        with pytest.raises(InputError, match=words):
+            part.with_state_noise(StateNoise(bad))
+    with pytest.raises(InputError, match="gains"):
+        StateNoise(np.ones(k), 0.0)
+    with pytest.raises(InputError, match="cross"):
+        StateNoise(np.ones(k), 1.0, 1.0, 2.0)
+
+
+def test_a_stream_knows_the_noise_of_the_state() -> None:
+    """Frame by frame the same as all at once."""
+    recording = human_tpose(payload=5.0)
+    motion, keep, own = recording.measured_motion
+    part, at = (
+        motion.select(np.arange(300, 306)).with_state_noise(recording.state_noise),
+        np.flatnonzero(keep)[300:306],
+    )
+    sensors = recording.foot_sensors(part, at)
+    batch = solve_frames(HumanDynamics(part, sensors, own, ("RightHand",)))
+    tree = PinocchioTree(recording.body.model())
+    online = OnlineHumanDynamics(tree, sensors, own, ("RightHand",), state_noise=recording.state_noise)
+    for f in range(6):
+        values = {s.name: s.values[f] for s in sensors}
+        got = online.step_links(float(f), part.kinematics(slice(f, f + 1)), values)
+        # The last frame's wrenches stand for this one's, which is as good to second order.
+        assert np.allclose(got.torque, batch.torque[f], atol=1e-2)
+        assert np.allclose(got.torque_sd, batch.torque_sd[f], rtol=2e-2)
