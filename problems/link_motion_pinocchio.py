@@ -144,6 +144,11 @@ class PinocchioTree:
             self._dofs, tuple(self._fixed_subspaces), 0, not self.floating,
         )  # fmt: skip
 
+    @property
+    def columns(self) -> tuple[IntArray, ...]:
+        """Of every joint: the components of pinocchio's velocities that belong to it."""
+        return tuple(self._columns)
+
     def motion(self, t: ArrayLike, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike) -> LinkMotion:
         """Link motion of n frames.
 

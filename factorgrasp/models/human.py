@@ -100,6 +100,28 @@ class HumanBody:
         return out
 
     @property
+    def markers(self) -> Mapping[str, tuple[str, FloatArray]]:
+        """Name to (link, position in its frame, m): four points on the skin of every segment.
+
+        A marker set for simulations and for suits whose markers follow it; names are the segment's with ``_1`` to ``_4`` behind.
+        """
+        out: dict[str, tuple[str, FloatArray]] = {}
+        for link, solid in self.segments.items():
+            end = self.ends[link]
+            length = float(np.linalg.norm(end))
+            along = end / length
+            # Half of the thickness of a bar of that mass and length with the density of water.
+            radius = max(0.5 * float(np.sqrt(solid.mass / (1000.0 * length))), 0.02)
+            side = np.cross(along, [1.0, 0.0, 0.0] if abs(along[0]) < 0.9 else [0.0, 1.0, 0.0])
+            side /= np.linalg.norm(side)
+            front = np.cross(side, along)
+            for k, (share, x, y) in enumerate(
+                ((0.15, 1.0, 0.0), (0.4, -0.6, 0.8), (0.65, -0.6, -0.8), (0.9, 0.8, 0.6)), start=1
+            ):
+                out[f"{link}_{k}"] = (link, share * end + radius * (x * side + y * front))
+        return out
+
+    @property
     def foot_length(self) -> float:
         """Heel to toe tip, m."""
         scale = self.height / tables.REFERENCE_STATURE[self.sex]
