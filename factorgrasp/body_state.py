@@ -28,7 +28,10 @@ WINDOW, OVERLAP = 300, 45
 _CHUNK = 128
 _KEY = 10
 _STEPS = 40
-_LOST_SD = 0.05
+MAX_GAP = 0.1
+"""s: what was hidden for longer is a gap, however well the motion around it is known."""
+# A component that a single frame tells of this much worse than usual (standard deviations) is not seen in it.
+_UNSEEN = 5.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +79,7 @@ def estimate_state(
     posture: FloatArray | None = None,
     posture_sd: float = POSTURE_SD,
     bandwidth: float | None = None,
+    max_gap: float = MAX_GAP,
 ) -> BodyState:
     """Configurations with velocities, accelerations and covariances.
 
@@ -94,6 +98,8 @@ def estimate_state(
         rad.
     bandwidth : float, optional
         Hz, at which motion prior and data weigh the same; found from the data by default.
+    max_gap : float
+        s: a configuration of which a part was hidden for longer is a gap.
 
     Raises
     ------
@@ -116,9 +122,7 @@ def estimate_state(
     jerk, _ = jerk_scale(_unrolled(body, q), variance, dt, bandwidth)
     q, Q, qd2, qdd2 = _smooth(body, q, rest, pull, jerk, dt)
     v, a = _derivatives(body, q, dt)
-    own = np.sqrt(np.diagonal(Q, axis1=1, axis2=2))
-    usual = np.maximum(5.0 * np.median(own, axis=0), _LOST_SD)
-    good = np.asarray((own <= usual).all(axis=1))
+    good = _told(body, q, pull, variance, round(max_gap / dt))
     good[[0, -1]] = False
     q, v, a = (np.where(good[:, None], x, np.nan) for x in (q, v, a))
     ratio, worst = _fit(body, observations, q, Q, good)
@@ -174,7 +178,7 @@ def _frame_by_frame(
     for low in range(0, count, _CHUNK):
         part = slice(low, low + _CHUNK)
         q[part] = _iterate(body, q[part], part, rest, pull, 6)
-    return q
+    return np.asarray(q)
 
 
 def _first(body: ObservedBody, frame: int, rest: FloatArray, pull: FloatArray) -> FloatArray:
@@ -306,6 +310,25 @@ def _information_variance(body: ObservedBody, q: FloatArray, pull: FloatArray) -
     H[:, np.arange(H.shape[1]), np.arange(H.shape[1])] += pull + 1e-12
     seen = (r != 0.0).any(axis=1)
     return np.asarray(np.median(np.diagonal(np.linalg.inv(H[seen]), axis1=1, axis2=2), axis=0))
+
+
+def _told(body: ObservedBody, q: FloatArray, pull: FloatArray, usual: FloatArray, most: int) -> BoolArray:
+    """Frames of which every component is seen, or was hidden for no more than `most` frames."""
+    unseen = np.empty((len(q), usual.size), dtype=bool)
+    for low in range(0, len(q), _CHUNK):
+        part = slice(low, low + _CHUNK)
+        _, J = body.residuals(q[part], part)
+        H = np.swapaxes(J, 1, 2) @ J
+        H[:, np.arange(H.shape[1]), np.arange(H.shape[1])] += pull + 1e-6
+        own = np.diagonal(np.linalg.inv(H), axis1=1, axis2=2)
+        unseen[part] = own > _UNSEEN**2 * usual
+    lost = unseen.copy()
+    for shift in range(1, most + 1):
+        # What stays after `most` frames of shrinking was hidden for longer.
+        lost[:-1] &= unseen[1:] if shift == 1 else lost[1:]
+    for _ in range(most):
+        lost[1:] |= lost[:-1] & unseen[1:]
+    return np.asarray(~lost.any(axis=1))
 
 
 def _unrolled(body: ObservedBody, q: FloatArray) -> FloatArray:

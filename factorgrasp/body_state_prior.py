@@ -6,7 +6,7 @@ import numpy as np
 
 from factorgrasp.typing import FloatArray
 
-BANDWIDTHS = (1.0, 15.0)
+BANDWIDTHS = (1.5, 15.0)
 """Hz, between which motion of people ends: below the first nothing is gained, and a sudden move would not be believed."""
 STRETCH = 1.2
 """s: motion is not stationary, so that the liveliest stretch of so long decides."""

@@ -28,6 +28,8 @@ Six = tuple[float, float, float, float, float, float]
 PLATE_COVARIANCE: Six = (59.0, 59.0, 36.0, 2.25, 2.25, 0.56)
 """N^2 and (Nm)^2 of a force plate, upright last: those of the bowing data set of Latella et al., Sensors 16(5), 2016."""
 
+# A person's foot or hand does not push two metres beside itself.
+_FARTHEST = 2.0
 _COMMON = ("file", "name", "frame", "covariance", "limit", "time_offset")
 _COLUMNS = (*FORCE, *POINT, *MOMENT)
 
@@ -198,7 +200,8 @@ def _names(one: Mapping[str, Any], where: str, path: Path) -> dict[str, str]:
 def _on_link(link: str, parts: Sequence[_Part], body: BodyMotion) -> ExternalWrench:
     total = np.zeros((body.clock.size, 6))
     variance = np.zeros(6)
-    for part in parts:
+    # A plate that nobody steps on has no noise to add to the others' on the same link.
+    for part in [part for part in parts if part.force.force.any()] or parts[:1]:
         force = part.force
         # About the ground's origin: there forces and moments may be interpolated each on its own, a centre of pressure may not.
         wrench = _below(force.wrench_about(np.zeros(3)), force.force, part.limit)
@@ -207,6 +210,7 @@ def _on_link(link: str, parts: Sequence[_Part], body: BodyMotion) -> ExternalWre
     values = total[body.good]
     motion = body.motion
     origin = motion.p[:, motion.link(link)]
+    _check_nearness(link, parts, values, origin)
     values[:, 3:] -= np.cross(origin, values[:, :3])
     return ExternalWrench(values, variance, f"force on {link}", link=link, frame="world")
 
@@ -252,6 +256,10 @@ def _below(values: FloatArray, force: FloatArray, limit: float | None) -> FloatA
 
 
 def _on_clock(body: BodyMotion, t: FloatArray, values: FloatArray, label: str) -> FloatArray:
+    if np.isfinite(values).all(axis=1).sum() < 2:
+        raise InputError(
+            label, "a sensor that measured something", "gaps everywhere", "Is it at its limit all the time?"
+        )
     found = synchronise(body.clock, {label: (t, values)})[label]
     if not np.isfinite(found[body.good]).any() and np.isfinite(values).any():
         clock = body.clock[body.good]
@@ -262,6 +270,23 @@ def _on_clock(body: BodyMotion, t: FloatArray, values: FloatArray, label: str) -
             "One clock? time_offset is added to the file's times",
         )
     return found
+
+
+def _check_nearness(link: str, parts: Sequence[_Part], values: FloatArray, origin: FloatArray) -> None:
+    """Refuse forces that act metres away from the link: millimetres, or another origin of the ground."""
+    size = np.linalg.norm(values[:, :3], axis=1)
+    loaded = size > max(10.0, 0.5 * float(np.nanmax(size, initial=0.0)))
+    points = [part for part in parts if part.force.point.any()]
+    if not loaded.any() or not points:
+        return
+    f, m = values[loaded, :3], values[loaded, 3:] - np.cross(origin[loaded], values[loaded, :3])
+    # The line of action's distance from the link's origin.
+    away = float(np.median(np.linalg.norm(np.cross(f, m), axis=1) / np.sum(f**2, axis=1)))
+    if away > _FARTHEST:
+        raise InputError(
+            f"force on {link}", f"a line of action within {_FARTHEST:g} m of the link's origin", f"{away:.4g} m away",
+            "Millimetres? Declare [mm] in the header. Or have motion and plates different origins?",
+        )  # fmt: skip
 
 
 def _check_direction(world: Mapping[str, Sequence[_Part]], body: BodyMotion) -> None:
@@ -277,6 +302,11 @@ def _check_direction(world: Mapping[str, Sequence[_Part]], body: BodyMotion) -> 
     weight = body.motion.total_mass * float(np.linalg.norm(g))
     size = float(np.linalg.norm(total))
     if weight == 0.0 or size < 0.2 * weight:
+        if 2e-4 * weight < size < 3e-3 * weight:
+            raise InputError(
+                "[[forces]]", f"N: the body weighs {weight:.0f} N", f"a mean of {size:.3g} in all: kN suspected",
+                "Declare the unit in the file's header, such as fz [kN]",
+            )  # fmt: skip
         largest = max(float(np.nanmax(np.linalg.norm(p.force.force, axis=1), initial=0.0)) for p in parts)
         if largest < 0.02 * weight:
             warnings.warn(

@@ -25,6 +25,7 @@ DERIVATIVES: Mapping[int, tuple[str, ...]] = {
 _BEYOND = 1.0
 # Hinges without limits: people's joints turn less than one turn.
 _WITHOUT_LIMITS = 2.0 * np.pi
+_UNLIMITED = 100.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +119,7 @@ def read_joint_table(
             "increasing times",
             f"{t[row]:.6g} s after {t[row - 1]:.6g} s in row {row + 1}",
         )
-    check_rate(float(np.median(np.diff(t))), f"{path}: column t")
+    check_stamps(t, path)
     keep = span(t, motion)
     t = t[keep]
     if t.size < 2:
@@ -129,12 +130,18 @@ def read_joint_table(
 
     angles = part([wanted[name] for name in used])
     for k, name in enumerate(used):
+        if np.isfinite(angles[:, k]).sum() < 2:
+            raise InputError(f"{path}: column {wanted[name]}", "at least two numbers", "gaps everywhere")
         _check_angles(model, name, angles[:, k], f"{path}: {wanted[name]}")
     position, quaternion = (
         part([wanted[name] for name in group if floating]) for group in (POSITION, QUATERNION)
     )
-    if floating and np.isfinite(position).any():
-        check_position(position, f"{path}: px, py, pz")
+    if floating:
+        if np.isfinite(position).all(axis=1).sum() < 2 or np.isfinite(quaternion).all(axis=1).sum() < 2:
+            raise InputError(
+                f"{path}: px, py, pz, qw, qx, qy, qz", "at least two poses of the root", "gaps everywhere"
+            )
+        _check_position(position, f"{path}: px, py, pz")
     derivatives = {}
     for order, endings in DERIVATIVES.items():
         names = [_derivative(wanted[name], order, endings, columns) for name in used]
@@ -147,6 +154,25 @@ def read_joint_table(
     if 2 in derivatives and 1 not in derivatives:
         raise InputError(f"{path}: columns", "velocities beside the accelerations", "none")
     return JointTable(path, t, used, angles, position, quaternion, derivatives)
+
+
+def check_stamps(t: FloatArray, path: Path) -> None:
+    """Refuse stamps that look like milliseconds; the hint is one for files."""
+    try:
+        check_rate(float(np.median(np.diff(t))), f"{path}: column t")
+    except InputError as error:
+        raise InputError(
+            error.field, error.expected, error.found, "Declare the unit in the file's header (t [ms], t [ns])"
+        ) from error
+
+
+def _check_position(position: FloatArray, field: str) -> None:
+    try:
+        check_position(position, field)
+    except InputError as error:
+        raise InputError(
+            error.field, error.expected, error.found, "Declare [mm] in the file's header"
+        ) from error
 
 
 def _derivative(
@@ -165,7 +191,7 @@ def _check_angles(model: Any, name: str, values: FloatArray, field: str) -> None
         return
     k = int(joint.idx_q)
     low, high = float(model.lowerPositionLimit[k]), float(model.upperPositionLimit[k])
-    if not np.isfinite([low, high]).all() or not low < high:
+    if not -_UNLIMITED < low < high < _UNLIMITED:
         low, high = -_WITHOUT_LIMITS, _WITHOUT_LIMITS
     good = values[np.isfinite(values)]
     beyond = (good < low - _BEYOND) | (good > high + _BEYOND)

@@ -10,15 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from factorgrasp.body_state import POSTURE_SD, BodyState, estimate_state, solve_posture
+from factorgrasp.body_state import MAX_GAP, POSTURE_SD, BodyState, estimate_state, solve_posture
 from factorgrasp.errors import InputError
+from factorgrasp.human_dynamics_joint_table import check_stamps
 from factorgrasp.models.human import HumanBody, configuration
 from factorgrasp.problems.body_observations import BodyObservations, ObservedBody, Placement, poses_only
 from factorgrasp.problems.human_dynamics_settings import PerName
 from factorgrasp.problems.link_motion_files import link_poses
 from factorgrasp.problems.link_motion_pinocchio import PinocchioTree
 from factorgrasp.recordings.opensim import MarkerRecording, read_osim_markers, read_trc
-from factorgrasp.recordings.plausibility import check_rate
 from factorgrasp.signals import resample_rotations, resample_uniform
 from factorgrasp.toml_tables import check_keys, close_matches, convert, get, place, sub_table
 from factorgrasp.typing import BoolArray, FloatArray
@@ -67,7 +67,7 @@ def from_observations(
         raise InputError("[motion] bandwidth", "above 0 Hz", f"{bandwidth:g}")
     state = estimate_state(
         model, t, observations, posture=posture, bandwidth=bandwidth,
-        posture_sd=_positive(motion, "posture_sd", POSTURE_SD),
+        posture_sd=_positive(motion, "posture_sd", POSTURE_SD), max_gap=_positive(motion, "max_gap", MAX_GAP),
     )  # fmt: skip
     _say_how_it_fits(state, file)
     _check_upright(model, state, gravity)
@@ -81,7 +81,7 @@ def _markers(
     model: Any, body: HumanBody | None, motion: Mapping[str, Any], file: Path, base_dir: Path
 ) -> tuple[BodyObservations, FloatArray]:
     seen = read_trc(file)
-    check_rate(float(np.median(np.diff(seen.t))), f"{file}: Time")
+    check_stamps(seen.t, file)
     stated = _placements(motion, body, base_dir)
     at = _matched(stated, seen, file)
     sd = _positive(motion, "marker_sd", MARKER_SD)
@@ -297,7 +297,7 @@ def _posture(model: Any, motion: Mapping[str, Any], key: str) -> FloatArray:
 def _positive(motion: Mapping[str, Any], key: str, default: float) -> float:
     value: float = get(motion, key, float, "[motion]", default)
     if value <= 0.0:
-        raise InputError(f"[motion] {key}", "a standard deviation above 0", f"{value:g}")
+        raise InputError(f"[motion] {key}", "a number above 0", f"{value:g}")
     return value
 
 

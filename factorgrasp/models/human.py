@@ -18,6 +18,7 @@ from factorgrasp.errors import InputError
 from factorgrasp.models import anthropometry as tables
 from factorgrasp.models.anthropometry import Sex
 from factorgrasp.models.solids import Column, Solid, box, gyration, join, remove, rod
+from factorgrasp.models.urdf_check import check_urdf
 from factorgrasp.typing import FloatArray
 
 JointKind = Literal["revolute", "spherical"]
@@ -268,6 +269,7 @@ def load_body(urdf: str | Path, floating: bool = True) -> Any:
     path = Path(urdf)
     if not path.is_file():
         raise InputError("urdf", "an existing URDF file", str(path))
+    check_urdf(path)
     try:
         return (
             pin.buildModelFromUrdf(str(path), pin.JointModelFreeFlyer())
