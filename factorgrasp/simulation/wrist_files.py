@@ -64,6 +64,7 @@ def write_wrist_recording(
     distortion = f"distortion = {list(camera.distortion)}\n" if camera.distortion else ""
     points = ",\n".join(f"  {[float(x) for x in point]}" for point in recording.layout.points)
     names = ", ".join(f'"{name}"' for name in recording.layout.names)
+    depth_sd = "" if recording.sensing.depth_sd is None else f"depth_sd = {recording.sensing.depth_sd!r}\n"
     # Written last: whoever finds it finds the rest.
     target = folder / "wrist.toml"
     write_text(
@@ -75,7 +76,7 @@ def write_wrist_recording(
         f"resolution = [{camera.width}, {camera.height}]\nrate = {camera.rate!r}\n{distortion}\n"
         '[blobs]\nfile = "blobs.csv"\n\n'
         f"[markers]\nnames = [{names}]\nlayout = [\n{points},\n]\nsd = {float(np.max(recording.layout.sd))!r}\n\n"
-        f"[noise]\npixel_sd = {recording.sensing.pixel_sd!r}\ndepth_sd = {recording.sensing.depth_sd!r}\n\n"
+        f"[noise]\npixel_sd = {recording.sensing.pixel_sd!r}\n{depth_sd}\n"
         f'[estimate]\nhand = "{recording.hand}"\n',
     )
     return target

@@ -13,9 +13,6 @@ from factorgrasp.typing import BoolArray, FloatArray, IntArray
 if TYPE_CHECKING:
     from factorgrasp.models.camera import Camera
 
-REFERENCE_DEPTH = 0.7
-"""Distance (m) at which `WristSensing.depth_sd` holds; a structured-light camera's noise grows with the square of the distance."""
-
 _PROBABILITIES = (
     "p_miss", "occlusion", "depth_missing", "depth_outliers", "drop_frames", "late_frames",
 )  # fmt: skip
@@ -31,8 +28,8 @@ class WristSensing:
         Frames a second (Hz).
     pixel_sd : float
         Of a blob's centre, per coordinate (px).
-    depth_sd : float
-        Of a blob's depth at 0.7 m (m); it grows with the square of the distance.
+    depth_sd : float or None
+        Of a blob's depth (m); None: that of a structured-light camera, 1.37 mm at 0.7 m (:func:`structured_light_sd`).
     depth : bool
         False: a camera without depth; every `z` is NaN.
     depth_missing : float
@@ -67,7 +64,7 @@ class WristSensing:
 
     rate: float = 30.0
     pixel_sd: float = 1.0
-    depth_sd: float = 1.5e-3
+    depth_sd: float | None = None
     depth: bool = True
     depth_missing: float = 0.05
     depth_outliers: float = 0.0
@@ -95,8 +92,9 @@ class WristSensing:
             if field.name in _PROBABILITIES and not 0.0 <= value < 1.0:
                 raise InputError(field.name, "a share between 0 and 1", repr(value))
         for name in ("pixel_sd", "depth_sd", "clutter", "clutter_near", "late_by", "latency"):
-            if getattr(self, name) < 0.0:
-                raise InputError(name, "a number that is not negative", repr(getattr(self, name)))
+            value = getattr(self, name)
+            if value is not None and value < 0.0:
+                raise InputError(name, "a number that is not negative", repr(value))
         for name in ("rate", "occlusion_time"):
             if getattr(self, name) <= 0.0:
                 raise InputError(name, "a positive number", repr(getattr(self, name)))
@@ -125,6 +123,12 @@ class SensedBlobs:
     z: FloatArray
     label: IntArray
     hidden: BoolArray
+
+
+def structured_light_sd(z: FloatArray) -> FloatArray:
+    """Axial noise (m) of a structured-light camera at depths z (m): ``1.2 mm + 1.9 mm/m^2 (z - 0.4 m)^2`` (Nguyen et al. 2012)."""
+    out: FloatArray = 1.2e-3 + 1.9e-3 * (z - 0.4) ** 2
+    return out
 
 
 def sense(
@@ -164,7 +168,8 @@ def sense(
     P = points[frame, marker]
     uv = camera.project(P) + sensing.pixel_sd * rng.standard_normal((frame.size, 2))
     z = P[:, 2] * (1.0 + sensing.depth_scale_error)
-    z = z + sensing.depth_sd * (z / REFERENCE_DEPTH) ** 2 * rng.standard_normal(frame.size)
+    sd = structured_light_sd(z) if sensing.depth_sd is None else sensing.depth_sd
+    z = z + sd * rng.standard_normal(frame.size)
     behind = rng.random(frame.size) < sensing.depth_outliers
     z = np.where(behind, z + rng.uniform(0.03, 0.15, frame.size), z)
     parts = [(frame, uv, z, marker + 1)]

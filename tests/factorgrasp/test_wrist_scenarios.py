@@ -50,7 +50,7 @@ def test_nominal_blobs_have_the_stated_statistics() -> None:
     recording = cordella2014(3, duration=40.0)
     uv, z = _errors(recording)
     assert np.allclose(uv.std(axis=0), 1.0, atol=0.05)
-    assert 1.3e-3 < np.nanstd(z) < 1.7e-3
+    assert 1.25e-3 < np.nanstd(z) < 1.5e-3
     assert 0.03 < np.isnan(z).mean() < 0.07
     frames = len(recording.blobs)
     assert frames == 1201
