@@ -1,0 +1,69 @@
+"""8-bit images as the detector takes them: checks, linear light, and colour without brightness."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from factorgrasp.errors import InputError
+from factorgrasp.typing import FloatArray
+
+ByteImage = NDArray[np.uint8]
+
+_DARK = 0.004
+"""Linear light below which a ratio of channels is noise."""
+LOG_STEPS = 24.0
+"""Steps of the 8-bit logarithm a factor of e."""
+
+
+def _linear_table() -> FloatArray:
+    x = np.arange(256) / 255.0
+    return np.asarray(np.where(x < 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4))
+
+
+LINEAR = _linear_table()
+"""Linear light (256,) of the steps of sRGB, 1 = white."""
+LOG_LIGHT = np.rint(LOG_STEPS * np.log((LINEAR + _DARK) / _DARK)).astype(np.uint8)
+"""Logarithm (256,) of linear light in :data:`LOG_STEPS`, from 0 at black."""
+LOG_RANGE = int(LOG_LIGHT[-1])
+
+
+def check_rgb(rgb: ArrayLike, field: str = "rgb") -> ByteImage:
+    """An image (h, w, 3) of uint8, or an InputError that names what it is instead."""
+    image = np.asarray(rgb)
+    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
+        hint = "Scale floats to 0..255 and cast them" if image.dtype.kind == "f" else ""
+        if image.ndim == 3 and image.shape[2] == 4:
+            hint = "Drop the alpha channel"
+        raise InputError(field, "8-bit colour, shape (h, w, 3), dtype uint8", f"{image.shape}, {image.dtype}", hint)
+    if min(image.shape[:2]) < 16:
+        raise InputError(field, "an image of at least 16 x 16 px", f"{image.shape[1]} x {image.shape[0]}")
+    return np.ascontiguousarray(image)
+
+
+def check_depth(depth: ArrayLike, size: tuple[int, int], field: str = "depth") -> FloatArray:
+    """Depth (h, w) in metres with NaN where it is missing, of the size (h, w) of the colour image."""
+    image = np.asarray(depth)
+    if image.shape != size:
+        raise InputError(
+            field,
+            f"one depth a pixel of the colour image, {size[1]} x {size[0]}",
+            f"shape {image.shape}",
+            "Register the depth to the colour camera first",
+        )
+    if image.dtype.kind not in "fui":
+        raise InputError(field, "numbers", str(image.dtype))
+    z = image.astype(float)
+    z[~(z > 0.0) | ~np.isfinite(z)] = np.nan
+    known = z[np.isfinite(z)]
+    if known.size and float(np.median(known)) > 20.0:
+        raise InputError(
+            field, "metres", f"a median of {np.median(known):.4g}", "Millimetres? Multiply by the depth scale, 0.001"
+        )
+    return z
+
+
+def log_chroma(rgb: ByteImage) -> tuple[NDArray[np.int16], NDArray[np.int16]]:
+    """log(red / green) and log(blue / green) of linear light, in :data:`LOG_STEPS`: unchanged by brightness."""
+    logs = LOG_LIGHT[rgb].astype(np.int16)
+    return logs[..., 0] - logs[..., 1], logs[..., 2] - logs[..., 1]
