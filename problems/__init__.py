@@ -36,6 +36,10 @@ if TYPE_CHECKING:
     )
     from factorgrasp.problems.human_dynamics_settings import HumanDynamicsNoise
     from factorgrasp.problems.link_motion import LinkMotion
+    from factorgrasp.problems.wrist_estimate import WristPoseEstimate
+    from factorgrasp.problems.wrist_pose import WristPose
+    from factorgrasp.problems.wrist_settings import WristAssociation, WristNoise, WristSettings
+    from factorgrasp.problems.wrist_track import WristTrack
 
 _WHERE = {
     "Accelerometer": "human_dynamics_sensors",
@@ -64,6 +68,12 @@ _WHERE = {
     "LinkMotion": "link_motion",
     "TorqueLimit": "human_dynamics_constraints",
     "UnilateralContact": "human_dynamics_constraints",
+    "WristAssociation": "wrist_settings",
+    "WristNoise": "wrist_settings",
+    "WristPose": "wrist_pose",
+    "WristPoseEstimate": "wrist_estimate",
+    "WristSettings": "wrist_settings",
+    "WristTrack": "wrist_track",
 }
 
 __all__ = [
@@ -93,6 +103,12 @@ __all__ = [
     "LinkMotion",
     "TorqueLimit",
     "UnilateralContact",
+    "WristAssociation",
+    "WristNoise",
+    "WristPose",
+    "WristPoseEstimate",
+    "WristSettings",
+    "WristTrack",
 ]
 
 

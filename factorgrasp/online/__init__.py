@@ -13,16 +13,25 @@ if TYPE_CHECKING:
     from factorgrasp.online.estimate import OnlineGraspEstimate, StreamCounts
     from factorgrasp.online.events import GraspEvent
     from factorgrasp.online.grasp import OnlineGraspPose
+    from factorgrasp.online.wrist import OnlineWristPose
 
 _WHERE = {
     "DetectorSettings": "change",
     "GraspEvent": "events",
     "OnlineGraspEstimate": "estimate",
     "OnlineGraspPose": "grasp",
+    "OnlineWristPose": "wrist",
     "StreamCounts": "estimate",
 }
 
-__all__ = ["DetectorSettings", "GraspEvent", "OnlineGraspEstimate", "OnlineGraspPose", "StreamCounts"]
+__all__ = [
+    "DetectorSettings",
+    "GraspEvent",
+    "OnlineGraspEstimate",
+    "OnlineGraspPose",
+    "OnlineWristPose",
+    "StreamCounts",
+]
 
 
 def __getattr__(name: str) -> Any:

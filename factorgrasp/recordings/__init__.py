@@ -1,5 +1,6 @@
 """Recordings: plain dataclasses, and one reader (and writer) for each file format."""
 
+from factorgrasp.recordings.blobs import BlobFrame, BlobRecording, read_blobs, write_blobs
 from factorgrasp.recordings.csv import (
     read_imu,
     read_joints,
@@ -35,6 +36,8 @@ from factorgrasp.recordings.streams import (
 from factorgrasp.recordings.tables import column_names, read_table
 
 __all__ = [
+    "BlobFrame",
+    "BlobRecording",
     "CoordinateTable",
     "ForceRecording",
     "Gaps",
@@ -45,6 +48,7 @@ __all__ = [
     "PoseStream",
     "StorageTable",
     "column_names",
+    "read_blobs",
     "read_coordinates",
     "read_external_loads",
     "read_force",
@@ -61,5 +65,6 @@ __all__ = [
     "read_table",
     "read_trc",
     "read_wrench_table",
+    "write_blobs",
     "write_csv",
 ]
