@@ -137,6 +137,7 @@ def draw_disc(
     visible = full * (canvas.depth[window] > depth - tolerance)
     light = canvas.light[window]
     light += visible[..., None] * (lambert(normal) * colour - light)
+    np.copyto(canvas.depth[window], depth, where=visible >= 0.5)
     return window, full, visible
 
 

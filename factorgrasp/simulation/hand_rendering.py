@@ -119,15 +119,15 @@ class HandVideo:
         height = (self.p_c_w[:, None] + np.einsum("nij,kj->nki", self.R_c_w, corners)) @ normal - radius
         return normal, float(height.min() - self.scene.table_gap)
 
-    def pose(self, t: float) -> tuple[FloatArray, FloatArray]:
-        """Wrist pose between the frames: geodesic rotation, straight position; constant speed beyond the ends."""
-        if len(self) == 1:
-            return self.R_c_w[0], self.p_c_w[0]
-        k = int(np.clip(np.searchsorted(self.t, t) - 1, 0, len(self) - 2))
-        share = (t - self.t[k]) / (self.t[k + 1] - self.t[k])
-        turn = lie.so3_log(self.R_c_w[k].T @ self.R_c_w[k + 1])
+    def pose(self, k: int, late: float = 0.0) -> tuple[FloatArray, FloatArray]:
+        """Wrist pose `late` seconds after frame k, at the velocity that its neighbours show."""
+        if late == 0.0 or len(self) == 1:
+            return self.R_c_w[k], self.p_c_w[k]
+        before, after = max(k - 1, 0), min(k + 1, len(self) - 1)
+        share = late / (self.t[after] - self.t[before])
+        turn = lie.so3_log(self.R_c_w[before].T @ self.R_c_w[after])
         R = self.R_c_w[k] @ lie.so3_exp(share * turn)
-        return R, self.p_c_w[k] + share * (self.p_c_w[k + 1] - self.p_c_w[k])
+        return R, self.p_c_w[k] + share * (self.p_c_w[after] - self.p_c_w[before])
 
     def markers(self, k: int) -> FloatArray:
         """Centres of the markers (6, 3) in the camera frame at frame k, m."""
@@ -142,7 +142,7 @@ class HandVideo:
         light = np.zeros(self._background.light.shape)
         depth, visible = self._background.depth, np.zeros(6)
         for i, late in enumerate(instants):
-            canvas, seen = self._draw(k, *self.pose(self.t[k] + late))
+            canvas, seen = self._draw(k, *self.pose(k, late))
             light += canvas.light / instants.size
             visible += seen / instants.size
             if i == instants.size // 2:

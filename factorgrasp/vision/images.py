@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -10,10 +12,10 @@ from factorgrasp.typing import FloatArray
 
 ByteImage = NDArray[np.uint8]
 
-_DARK = 0.004
+DARK = 0.004
 """Linear light below which a ratio of channels is noise."""
-LOG_STEPS = 24.0
-"""Steps of the 8-bit logarithm a factor of e."""
+LOG_STEPS = 22.0
+"""Steps of the 8-bit logarithm a factor of e: so many that a pair of ratios still is one 16-bit number."""
 
 
 def _linear_table() -> FloatArray:
@@ -23,7 +25,7 @@ def _linear_table() -> FloatArray:
 
 LINEAR = _linear_table()
 """Linear light (256,) of the steps of sRGB, 1 = white."""
-LOG_LIGHT = np.rint(LOG_STEPS * np.log((LINEAR + _DARK) / _DARK)).astype(np.uint8)
+LOG_LIGHT = np.rint(LOG_STEPS * np.log((LINEAR + DARK) / DARK)).astype(np.uint8)
 """Logarithm (256,) of linear light in :data:`LOG_STEPS`, from 0 at black."""
 LOG_RANGE = int(LOG_LIGHT[-1])
 
@@ -41,8 +43,8 @@ def check_rgb(rgb: ArrayLike, field: str = "rgb") -> ByteImage:
     return np.ascontiguousarray(image)
 
 
-def check_depth(depth: ArrayLike, size: tuple[int, int], field: str = "depth") -> FloatArray:
-    """Depth (h, w) in metres with NaN where it is missing, of the size (h, w) of the colour image."""
+def check_depth(depth: ArrayLike, size: tuple[int, int], field: str = "depth") -> NDArray[Any]:
+    """Depth (h, w) in metres of the size (h, w) of the colour image, as it came; :func:`metres` makes NaN of what is missing."""
     image = np.asarray(depth)
     if image.shape != size:
         raise InputError(
@@ -53,14 +55,32 @@ def check_depth(depth: ArrayLike, size: tuple[int, int], field: str = "depth") -
         )
     if image.dtype.kind not in "fui":
         raise InputError(field, "numbers", str(image.dtype))
-    z = image.astype(float)
-    z[~(z > 0.0) | ~np.isfinite(z)] = np.nan
-    known = z[np.isfinite(z)]
+    # A look at every 64th pixel tells the unit.
+    known = metres(image[::8, ::8])
+    known = known[np.isfinite(known)]
     if known.size and float(np.median(known)) > 20.0:
         raise InputError(
             field, "metres", f"a median of {np.median(known):.4g}", "Millimetres? Multiply by the depth scale, 0.001"
         )
+    return image
+
+
+def metres(depth: NDArray[Any]) -> FloatArray:
+    """A part of a depth image as floats with NaN where it is missing (zero, negative, not finite)."""
+    z = depth.astype(float)
+    z[~((z > 0.0) & (z < np.inf))] = np.nan
     return z
+
+
+def chroma_index(rgb: ByteImage, cv2: Any) -> NDArray[np.uint16]:
+    """Row of the flat table of :attr:`ColourReference.table` of every pixel (h, w); fast."""
+    logs = cv2.LUT(rgb, LOG_LIGHT).astype(np.uint16)
+    width = 2 * LOG_RANGE + 1
+    # (red - green + range) * width + (blue - green + range), in arithmetic modulo 2^16 that ends within it.
+    offset = np.uint16(LOG_RANGE * (width + 1))
+    return np.asarray(
+        logs[..., 0] * np.uint16(width) + logs[..., 2] - logs[..., 1] * np.uint16(width + 1) + offset, dtype=np.uint16
+    )
 
 
 def log_chroma(rgb: ByteImage) -> tuple[NDArray[np.int16], NDArray[np.int16]]:
