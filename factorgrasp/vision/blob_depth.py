@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from factorgrasp.typing import BoolArray, FloatArray
+from factorgrasp.vision.images import middle as centre
 
 _LEAST_GATE = 4e-3
 """m: what differs less from the median is never called an outlier."""
@@ -42,8 +43,8 @@ def disc_depth(
         return np.nan, np.nan
     kept = np.ones(z.size, dtype=bool)
     for _ in range(2):
-        middle = float(np.median(z[kept]))
-        spread = 1.4826 * float(np.median(np.abs(z[kept] - middle)))
+        middle = float(centre(z[kept]))
+        spread = 1.4826 * float(centre(np.abs(z[kept] - middle)))
         kept = np.abs(z - middle) <= max(3.5 * spread, _LEAST_GATE)
     z, u, v = z[kept], u[kept] - at[0], v[kept] - at[1]
     if z.size < max(3, 0.2 * mask.sum()):
@@ -52,7 +53,8 @@ def disc_depth(
     if z.size >= 12:
         rows = np.column_stack([rows, u, v])
     normal = rows.T @ rows
-    if rows.shape[1] == 3 and np.linalg.cond(normal) > 1e6:
+    # Pixels on one line do not show a slope.
+    if rows.shape[1] == 3 and np.linalg.det(normal[1:, 1:]) < 1e-3 * normal[1, 1] * normal[2, 2]:
         rows, normal = rows[:, :1], normal[:1, :1]
     solution = np.linalg.solve(normal, rows.T @ z)
     residual = z - rows @ solution

@@ -16,6 +16,7 @@ from factorgrasp.typing import BoolArray, FloatArray
 from factorgrasp.vision.blob_depth import disc_depth
 from factorgrasp.vision.colour import ColourReference
 from factorgrasp.vision.images import LOG_LIGHT, LOG_STEPS, ByteImage, check_depth, check_rgb, chroma_index, metres
+from factorgrasp.vision.images import middle as median
 from factorgrasp.vision.opencv import load_cv2
 from factorgrasp.vision.outline_fit import FittedCentre, fit_outline, outline_rms, split_blob
 from factorgrasp.vision.settings import DetectorSettings
@@ -29,6 +30,8 @@ _MOST_COMPONENTS = 80
 _SEVERAL = 24
 """px: a component of that size may be several markers."""
 _UNKNOWN_DEPTH_VARIANCE = 1.0
+_LEAST_ALIKE = 0.5
+"""Similarity relative to the most similar blob: all markers are in the same light."""
 _WHOLE = (0.93, 1.30)
 """Area of a whole marker relative to what is expected."""
 _SHARES = (0.22, 3.6)
@@ -104,10 +107,12 @@ class BlobDetector:
         self.reference = reference
         self.settings = settings or DetectorSettings()
         self.camera = camera
+        self._kernels: tuple[Any, ...] = ()
         # 1: perhaps the edge of a marker; 2: surely inside of one.
         seeds = (reference.table >= self.settings.threshold).astype(np.uint8)
         seeds += (reference.strict_table >= self.settings.threshold).astype(np.uint8)
-        self._seeds = seeds.ravel()
+        self._seeds = np.zeros(1 << 16, dtype=np.uint8)
+        self._seeds[: seeds.size] = seeds.ravel()
 
     def detect(self, rgb: ArrayLike, depth: ArrayLike | None = None) -> DetectedBlobs:
         """The blobs of an image.
@@ -124,6 +129,8 @@ class BlobDetector:
             When the image is not 8-bit colour, or its size is neither the depth's nor the camera's.
         """
         cv2 = load_cv2()
+        if not self._kernels:
+            self._kernels = tuple(_kernel(cv2, radius) for radius in (1, 3, 6))
         image = check_rgb(rgb)
         size = image.shape[:2]
         if self.camera is not None and size != (self.camera.height, self.camera.width):
@@ -139,7 +146,7 @@ class BlobDetector:
         table = None
         if z is not None and self.settings.region in ("auto", "depth"):
             table = fit_table(z)
-        seeds = self._seeds[chroma_index(image, cv2)]
+        seeds = self._seeds.take(chroma_index(image, cv2))
         rejected: Counter[str] = Counter()
         candidates = self._candidates(image, z, table, seeds, rejected, cv2)
         return self._finish(candidates, rejected, table)
@@ -187,6 +194,9 @@ class BlobDetector:
             value, variance = np.nan, np.nan
             if near is not None:
                 value, variance = disc_depth(near, window & (soft.alpha > 0.5), soft.centroid, s.depth_correlation)
+                if table is not None and table.depth(corner + soft.centroid) - value < s.least_height:
+                    rejected["on the table"] += 1
+                    continue
             out.append(_Candidate(soft, similarity, value, variance))
         return out
 
@@ -197,7 +207,7 @@ class BlobDetector:
         inside = labels == label
         mine = inside.astype(np.uint8)
         others = ((labels != 0) & ~inside).astype(np.uint8)
-        small, medium, wide = (_kernel(cv2, radius) for radius in (1, 3, 6))
+        small, medium, wide = self._kernels
         window = cv2.dilate(mine, medium).astype(bool)
         taken = cv2.dilate(others, medium).astype(bool)
         ring = cv2.dilate(mine, wide).astype(bool) & ~window & ~taken
@@ -225,12 +235,15 @@ class BlobDetector:
             return True
         v, u = np.nonzero(mask)
         middle = corner + np.array([u.mean(), v.mean()])
-        return bool(float(table.depth(middle)) - float(np.median(values)) > self.settings.least_height)
+        return bool(float(table.depth(middle)) - float(median(values)) > self.settings.least_height)
 
     def _finish(
         self, candidates: list[_Candidate], rejected: Counter[str], table: TablePlane | None
     ) -> DetectedBlobs:
         """Sizes compared with each other: what is whole, hidden, merged or no marker."""
+        alike = max((c.similarity for c in candidates), default=0.0) * _LEAST_ALIKE
+        rejected["other colour"] += sum(c.similarity < alike for c in candidates)
+        candidates = [c for c in candidates if c.similarity >= alike]
         scale = _scales(candidates)
         expected = _consensus(candidates, scale)
         if self.camera is not None and self.settings.marker_diameter > 0.0:
@@ -271,7 +284,7 @@ class BlobDetector:
             np.array([row[2].similarity for row in rows], dtype=float),
             np.array([row[2].soft.area for row in rows], dtype=float),
             tuple(row[3] for row in rows),
-            dict(rejected),
+            {reason: number for reason, number in rejected.items() if number},
             table,
         )
 

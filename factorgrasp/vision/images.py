@@ -30,6 +30,26 @@ LOG_LIGHT = np.rint(LOG_STEPS * np.log((LINEAR + DARK) / DARK)).astype(np.uint8)
 LOG_RANGE = int(LOG_LIGHT[-1])
 
 
+def _index_tables() -> tuple[NDArray[np.uint16], ...]:
+    """What each channel adds to ``(red - green + range) * width + (blue - green + range)``, modulo 2^16, within which the sum ends."""
+    width, logs = 2 * LOG_RANGE + 1, LOG_LIGHT.astype(np.int64)
+    parts = (logs * width, -logs * (width + 1), logs + LOG_RANGE * (width + 1))
+    return tuple((part % 65536).astype(np.uint16) for part in parts)
+
+
+_INDEX = _index_tables()
+
+
+def middle(values: FloatArray) -> Any:
+    """Median of the first axis, the lower one of two, without NaN: ten times faster than numpy's on a few pixels."""
+    return np.sort(values, axis=0)[(values.shape[0] - 1) // 2]
+
+
+def quantile(values: FloatArray, share: float) -> float:
+    """Order statistic (without interpolation) of a few numbers."""
+    return float(np.sort(values)[int(share * (values.size - 1))])
+
+
 def check_rgb(rgb: ArrayLike, field: str = "rgb") -> ByteImage:
     """An image (h, w, 3) of uint8, or an InputError that names what it is instead."""
     image = np.asarray(rgb)
@@ -74,13 +94,11 @@ def metres(depth: NDArray[Any]) -> FloatArray:
 
 def chroma_index(rgb: ByteImage, cv2: Any) -> NDArray[np.uint16]:
     """Row of the flat table of :attr:`ColourReference.table` of every pixel (h, w); fast."""
-    logs = cv2.LUT(rgb, LOG_LIGHT).astype(np.uint16)
-    width = 2 * LOG_RANGE + 1
-    # (red - green + range) * width + (blue - green + range), in arithmetic modulo 2^16 that ends within it.
-    offset = np.uint16(LOG_RANGE * (width + 1))
-    return np.asarray(
-        logs[..., 0] * np.uint16(width) + logs[..., 2] - logs[..., 1] * np.uint16(width + 1) + offset, dtype=np.uint16
-    )
+    planes = cv2.split(rgb)
+    index: NDArray[np.uint16] = cv2.LUT(planes[0], _INDEX[0])
+    index += cv2.LUT(planes[1], _INDEX[1])
+    index += cv2.LUT(planes[2], _INDEX[2])
+    return index
 
 
 def log_chroma(rgb: ByteImage) -> tuple[NDArray[np.int16], NDArray[np.int16]]:

@@ -17,6 +17,8 @@ _INSIDE = 0.9
 """px: a point of the edge that far inside of the outline is no edge of the marker."""
 _EDGE_SD = 0.12
 """px: least scatter of an edge point about the outline: noise, pixels, shape."""
+_DOUBT = 0.6
+"""px: fits whose cost differs by less than the square of this are both possible."""
 _STEPS = 8
 _STARTS = 7
 
@@ -87,6 +89,10 @@ def fit_outline(points: FloatArray, moment: FloatArray, middle: FloatArray) -> F
     noise = 2.0 * max(rms, _EDGE_SD) ** 2 * points.shape[0] / max(count, 8)
     spread = np.minimum(noise / np.maximum(values, 1e-6), (0.5 * size) ** 2)
     covariance = (vectors * spread) @ vectors.T
+    # A small part of an outline may fit in more than one place: that doubt is the spread of the places.
+    chance = np.exp(-0.5 * (cost - cost[best]) / _DOUBT**2)
+    away = centre - centre[best]
+    covariance = covariance + (away * chance[:, None]).T @ away / chance.sum()
     return FittedCentre(centre[best], covariance, float(on.mean()), rms)
 
 

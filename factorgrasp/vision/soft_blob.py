@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from factorgrasp.typing import BoolArray, FloatArray
-from factorgrasp.vision.images import LINEAR, ByteImage
+from factorgrasp.vision.images import LINEAR, ByteImage, middle, quantile
 
 _SHADING = 0.2
 """Relative standard deviation of the brightness of the surroundings."""
@@ -85,17 +85,17 @@ def soften(rgb: ByteImage, inside: BoolArray, ring: BoolArray, window: BoolArray
     around = light[ring]
     if around.shape[0] < 8:
         return None
-    back = np.median(around, axis=0)
+    back = middle(around)
     away = around - back
     # A few pixels of something else beside the hand must not decide the scatter.
     size = np.einsum("ij,ij->i", away, away)
-    kept = away[size <= np.quantile(size, 0.9)]
+    kept = away[size <= quantile(size, 0.9)]
     scatter = kept.T @ kept / kept.shape[0] + np.diag(1e-6 + (0.01 * back) ** 2)
     # Shading makes the same skin brighter or darker under the marker than in the ring: that must not look like marker.
     scatter += _SHADING**2 * np.outer(back, back)
     direction = np.linalg.solve(scatter, light[inside].mean(axis=0) - back)
     value = (light - back) @ direction
-    full = float(np.quantile(value[inside], 0.7))
+    full = quantile(value[inside], 0.7)
     if full < 4.0:
         # Less than two standard deviations between marker and surroundings.
         return None
@@ -109,10 +109,10 @@ def soften(rgb: ByteImage, inside: BoolArray, ring: BoolArray, window: BoolArray
     if weight.sum() < 1.0:
         return None
     shape = find_outline(only, np.array([weight @ u, weight @ v]) / weight.sum())
-    area, middle, moment = polygon_moments(shape)
+    area, heart, moment = polygon_moments(shape)
     if area < 1.0:
         return None
-    near = window & _within(moment, middle, _EDGE, alpha.shape)
+    near = window & _within(moment, heart, _EDGE, alpha.shape)
     v, u = np.nonzero(near)
     weight = alpha[v, u]
     total = float(weight.sum())
@@ -121,7 +121,7 @@ def soften(rgb: ByteImage, inside: BoolArray, ring: BoolArray, window: BoolArray
     centroid = np.array([weight @ u, weight @ v]) / total
     arm = np.column_stack([u, v]) - centroid
     covariance = spread / total**2 * (arm.T @ arm)
-    return SoftBlob(corner, alpha, window, spread, centroid, covariance, shape, area, moment, middle)
+    return SoftBlob(corner, alpha, window, spread, centroid, covariance, shape, area, moment, heart)
 
 
 def _background_slope(alpha: FloatArray, ring: BoolArray) -> tuple[FloatArray, float]:
@@ -130,8 +130,8 @@ def _background_slope(alpha: FloatArray, ring: BoolArray) -> tuple[FloatArray, f
     v, u = np.nonzero(ring)
     rows = np.column_stack([np.ones(u.size), u - 0.5 * w, v - 0.5 * h])
     values = alpha[v, u]
-    kept = np.abs(values - np.median(values))
-    near = kept <= np.quantile(kept, 0.9)
+    kept = np.abs(values - middle(values))
+    near = kept <= quantile(kept, 0.9)
     rows, values = rows[near], values[near]
     normal = rows.T @ rows + np.diag([1e-9, 1.0, 1.0])
     plane = np.linalg.solve(normal, rows.T @ values)
@@ -140,21 +140,21 @@ def _background_slope(alpha: FloatArray, ring: BoolArray) -> tuple[FloatArray, f
     return np.clip(level, -0.3, 0.3), spread
 
 
-def _within(moment: FloatArray, middle: FloatArray, margin: float, shape: tuple[int, ...]) -> BoolArray:
+def _within(moment: FloatArray, heart: FloatArray, margin: float, shape: tuple[int, ...]) -> BoolArray:
     """Pixels (h, w) inside of the ellipse with a second moment, grown by a margin (px)."""
     values, vectors = np.linalg.eigh(moment)
     grown = np.sqrt(4.0 * np.maximum(values, 0.05)) + margin
     inverse = (vectors / grown) @ vectors.T
     v, u = np.mgrid[0 : shape[0], 0 : shape[1]]
-    x, y = u - middle[0], v - middle[1]
+    x, y = u - heart[0], v - heart[1]
     p, q = inverse[0, 0] * x + inverse[0, 1] * y, inverse[1, 0] * x + inverse[1, 1] * y
     return np.asarray(p * p + q * q <= 1.0)
 
 
-def find_outline(alpha: FloatArray, centre: FloatArray, step: float = 0.25) -> FloatArray:
+def find_outline(alpha: FloatArray, centre: FloatArray, step: float = 0.5) -> FloatArray:
     """Where alpha first falls through one half on rays (_RAYS, 2) from a centre."""
     h, w = alpha.shape
-    reach = np.arange(0.0, float(np.hypot(h, w)), step)
+    reach = np.arange(0.0, 0.75 * float(np.hypot(h, w)), step)
     u = centre[0] + reach[None] * _DIRECTIONS[:, :1]
     v = centre[1] + reach[None] * _DIRECTIONS[:, 1:]
     value = bilinear(alpha, u, v)
@@ -195,8 +195,8 @@ def polygon_moments(points: FloatArray) -> tuple[float, FloatArray, FloatArray]:
     area = 0.5 * float(cross.sum())
     if abs(area) < 1e-9:
         return 0.0, origin, np.eye(2)
-    middle = cross @ (p + q) / (6.0 * area)
+    heart = cross @ (p + q) / (6.0 * area)
     second = np.einsum("k,ki,kj->ij", cross, p, p) + np.einsum("k,ki,kj->ij", cross, q, q)
     second += 0.5 * (np.einsum("k,ki,kj->ij", cross, p, q) + np.einsum("k,ki,kj->ij", cross, q, p))
-    moment = second / (12.0 * area) - np.outer(middle, middle)
-    return abs(area), origin + middle, moment
+    moment = second / (12.0 * area) - np.outer(heart, heart)
+    return abs(area), origin + heart, moment
