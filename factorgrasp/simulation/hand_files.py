@@ -16,7 +16,8 @@ from factorgrasp.vision.opencv import load_cv2
 def write_frames(video: HandVideo, folder: str | Path, movie: bool = False) -> Path:
     """Render a recording into a folder.
 
-    Written are ``rgb/000000.png`` (8 bit), ``depth/000000.png`` (16 bit, mm), ``rgb/timestamps.csv``, ``truth.npz`` and, on request, ``movie.avi`` (Motion JPEG).
+    Written are ``rgb/000000.png`` (8 bit), ``depth/000000.png`` (16 bit, mm), ``rgb/timestamps.csv``, ``truth.npz`` and, on request,
+    ``movie.avi`` (Motion JPEG).
     ``truth.npz`` holds ``t``, ``uv`` (n, 6, 2), ``marker_depth`` (n, 6), ``visible`` (n, 6), ``R_c_w``, ``p_c_w`` and ``layout``.
 
     Returns
@@ -33,9 +34,13 @@ def write_frames(video: HandVideo, folder: str | Path, movie: bool = False) -> P
     try:
         if movie:
             size = (video.camera.width, video.camera.height)
-            writer = cv2.VideoWriter(str(out / "movie.avi"), cv2.VideoWriter_fourcc(*"MJPG"), video.camera.rate, size)
+            writer = cv2.VideoWriter(
+                str(out / "movie.avi"), cv2.VideoWriter_fourcc(*"MJPG"), video.camera.rate, size
+            )
             if not writer.isOpened():
-                raise InputError("movie", "an OpenCV that can write Motion JPEG", "one that cannot", "Write PNGs only")
+                raise InputError(
+                    "movie", "an OpenCV that can write Motion JPEG", "one that cannot", "Write PNGs only"
+                )
             writer.set(cv2.VIDEOWRITER_PROP_QUALITY, 98)
         for k, frame in enumerate(video):
             colour = frame.rgb[:, :, ::-1]

@@ -91,7 +91,9 @@ def draw_cone(
     shade = lambert(normal / length)
     if texture > 0.0:
         # Wrinkles: a pattern that is fixed to the cone.
-        shade = shade * (1.0 + texture * np.sin(900.0 * t * np.linalg.norm(axis)) * np.sin(7.0 * normal[..., 1]))
+        shade = shade * (
+            1.0 + texture * np.sin(900.0 * t * np.linalg.norm(axis)) * np.sin(7.0 * normal[..., 1])
+        )
     visible = coverage * (depth < canvas.depth[window])
     light = canvas.light[window]
     light += visible[..., None] * (shade[..., None] * colour - light)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -14,7 +14,7 @@ from factorgrasp import lie
 from factorgrasp.errors import InputError
 from factorgrasp.models.camera import Camera
 from factorgrasp.simulation.hand_raster import Canvas, draw_cone, draw_disc
-from factorgrasp.simulation.hand_scene import Hidden, HandScene, to_srgb
+from factorgrasp.simulation.hand_scene import HandScene, Hidden, to_srgb
 from factorgrasp.simulation.hand_shape import SKIN_TONES, HandShape, build_hand
 from factorgrasp.typing import FloatArray
 
@@ -79,7 +79,7 @@ class HandVideo:
     R_c_w: FloatArray
     p_c_w: FloatArray
     layout: FloatArray
-    scene: HandScene = HandScene()
+    scene: HandScene = field(default_factory=HandScene)
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -87,10 +87,14 @@ class HandVideo:
         R, layout = np.asarray(self.R_c_w, dtype=float), np.asarray(self.layout, dtype=float)
         if t.ndim != 1 or R.shape != (t.size, 3, 3) or p.shape != (t.size, 3):
             raise InputError(
-                "hand video: t, R_c_w, p_c_w", "shapes (n,), (n, 3, 3) and (n, 3)", f"{t.shape}, {R.shape}, {p.shape}"
+                "hand video: t, R_c_w, p_c_w",
+                "shapes (n,), (n, 3, 3) and (n, 3)",
+                f"{t.shape}, {R.shape}, {p.shape}",
             )
         if p[:, 2].min() < 0.15:
-            raise InputError("hand video: p_c_w", "a hand at least 0.15 m before the camera", f"{p[:, 2].min():.3g} m")
+            raise InputError(
+                "hand video: p_c_w", "a hand at least 0.15 m before the camera", f"{p[:, 2].min():.3g} m"
+            )
         for name, value in (("t", t), ("R_c_w", R), ("p_c_w", p), ("layout", layout)):
             object.__setattr__(self, name, value)
 
@@ -147,7 +151,7 @@ class HandVideo:
             visible += seen / instants.size
             if i == instants.size // 2:
                 depth = canvas.depth
-        gradient = 1.0 + scene.light_gradient * np.linspace(-0.5, 0.5, light.shape[1])[None, :, None]
+        gradient = 1.0 + scene.light_gradient * np.linspace(-0.5, 0.5, self.camera.width)[None, :, None]
         light = light * gradient * scene.illuminant
         if scene.lens_blur > 0.0:
             light = ndimage.gaussian_filter(light, (scene.lens_blur, scene.lens_blur, 0.0))
@@ -191,7 +195,13 @@ class HandVideo:
             return np.asarray(foot + right * across + down * along + up * normal)
 
         # Both signs of `across` and `along` occur; the places surround the hand either way.
-        draw_cone(canvas, at(-0.15, -0.13, 0.005), at(-0.05, -0.16, 0.005), np.array([0.004, 0.004]), np.array([0.03, 0.07, 0.30]))
+        draw_cone(
+            canvas,
+            at(-0.15, -0.13, 0.005),
+            at(-0.05, -0.16, 0.005),
+            np.array([0.004, 0.004]),
+            np.array([0.03, 0.07, 0.30]),
+        )
         draw_disc(canvas, at(0.16, 0.12, 0.002), normal, 0.007, np.array([0.04, 0.16, 0.24]))
         draw_disc(canvas, at(-0.2, 0.1, 0.001), normal, 0.045, np.array([0.10, 0.15, 0.26]))
         draw_cone(canvas, at(0.18, -0.12, 0.02), at(0.18, -0.06, 0.02), np.array([0.022, 0.022]), _WOOD * 0.8)
@@ -295,9 +305,8 @@ def _table_light(x: FloatArray, y: FloatArray, kind: str, seed: int) -> FloatArr
     if kind == "grey":
         return np.broadcast_to(_GREY, (*x.shape, 3)).copy()
     rng = np.random.default_rng([seed, 77])
-    wave = sum(
-        a * np.sin(f * y + 3.0 * np.sin(g * x + rng.uniform(0, 6)) + rng.uniform(0, 6))
-        for a, f, g in ((0.5, 180.0, 6.0), (0.3, 420.0, 9.0), (0.2, 1100.0, 4.0))
-    )
+    wave = np.zeros(x.shape)
+    for a, f, g in ((0.5, 180.0, 6.0), (0.3, 420.0, 9.0), (0.2, 1100.0, 4.0)):
+        wave += a * np.sin(f * y + 3.0 * np.sin(g * x + rng.uniform(0, 6)) + rng.uniform(0, 6))
     tone = (1.0 + 0.22 * wave)[..., None]
     return np.asarray(_WOOD * tone ** np.array([0.9, 1.0, 1.2]))

@@ -104,7 +104,14 @@ class HandScene:
             raise InputError("scene: light", "a factor above 0, at most 10", repr(self.light))
         if not 1500.0 <= self.colour_temperature <= 25000.0:
             raise InputError("scene: colour_temperature", "1500 to 25000 K", repr(self.colour_temperature))
-        for name in ("shutter", "lens_blur", "sensor_noise", "depth_noise", "depth_missing", "depth_outliers"):
+        for name in (
+            "shutter",
+            "lens_blur",
+            "sensor_noise",
+            "depth_noise",
+            "depth_missing",
+            "depth_outliers",
+        ):
             if not 0.0 <= getattr(self, name) < np.inf:
                 raise InputError(f"scene: {name}", "a number not below zero", repr(getattr(self, name)))
         if not 0.0 < self.marker_diameter < 0.1:

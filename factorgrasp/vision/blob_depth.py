@@ -13,9 +13,7 @@ _QUANTISATION = 1e-3
 """m, of depth images."""
 
 
-def disc_depth(
-    depth: FloatArray, mask: BoolArray, at: FloatArray, correlated: float
-) -> tuple[float, float]:
+def disc_depth(depth: FloatArray, mask: BoolArray, at: FloatArray, correlated: float) -> tuple[float, float]:
     """Depth and its variance at the centroid of a blob.
 
     The disc is taken as a plane, whose depth at the centroid is what counts: a disc of which a part is missing would else be read where its

@@ -1,7 +1,7 @@
 """The reference colour of the markers: a wide histogram of colour without brightness, and that of what surrounds them.
 
-Colours are pairs ``x = log(red / green)``, ``y = log(blue / green)`` of linear light. More or less light leaves them, another colour temperature
-shifts them; the histogram is smoothed by about the shift between a cloudy sky and a lamp, so that it stays of use in both.
+Colours are pairs ``x = log(red / green)``, ``y = log(blue / green)`` of linear light. More or less light leaves them, another
+colour temperature shifts them; the histogram is smoothed by about the shift between a cloudy sky and a lamp, so that it serves in both.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from factorgrasp.atomic import write_text
@@ -89,7 +89,8 @@ class ColourReference:
     def similarity(self, x: ArrayLike, y: ArrayLike) -> float:
         """Bhattacharyya coefficient (0 to 1) of the pixels' histogram with that of the markers or of their edges, all smoothed."""
         cell = [
-            np.clip((np.asarray(c, dtype=float) + SPAN) * BINS / (2.0 * SPAN), 0, BINS - 1).astype(np.intp) for c in (x, y)
+            np.clip((np.asarray(c, dtype=float) + SPAN) * BINS / (2.0 * SPAN), 0, BINS - 1).astype(np.intp)
+            for c in (x, y)
         ]
         counts = np.bincount(cell[0] * BINS + cell[1], minlength=BINS**2).reshape(BINS, BINS)
         found = _NARROW @ (counts / max(counts.sum(), 1)) @ _NARROW.T
@@ -124,7 +125,9 @@ def read_colour(path: str | Path) -> ColourReference:
             _dense(content["mixtures"]),
         )
     except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
-        raise InputError(str(path), "a colour reference written by save()", f"{type(error).__name__}: {error}") from error
+        raise InputError(
+            str(path), "a colour reference written by save()", f"{type(error).__name__}: {error}"
+        ) from error
 
 
 def learn_colour(
@@ -151,10 +154,7 @@ def learn_colour(
     image = check_rgb(rgb)
     if (click is None) == (patch is None):
         raise InputError("learn_colour", "a click or a patch", "both" if click is not None else "neither")
-    if click is not None:
-        mask = _spot_around(image, click)
-    else:
-        mask = _patch_mask(image, patch)
+    mask = _patch_mask(image, patch) if click is None else _spot_around(image, click)
     return learn_from_mask(image, mask, "click" if click is not None else "patch")
 
 
@@ -170,9 +170,15 @@ def learn_from_mask(image: ByteImage, mask: BoolArray, field: str) -> ColourRefe
     # Pixels that already look like a marker are other markers, not background.
     away &= np.hypot(x - mean[0], y - mean[1]) > 0.6 * _LEAST_CONTRAST
     if away.sum() < 50:
-        raise InputError(field, "a marker that differs from the rest of the image", "the same colour everywhere")
+        raise InputError(
+            field, "a marker that differs from the rest of the image", "the same colour everywhere"
+        )
     return ColourReference(
-        histogram(x[core], y[core]), histogram(x[away], y[away]), mean, int(core.sum()), _mixtures(image, mask, core)
+        histogram(x[core], y[core]),
+        histogram(x[away], y[away]),
+        mean,
+        int(core.sum()),
+        _mixtures(image, mask, core),
     )
 
 
@@ -190,7 +196,7 @@ def _mixtures(image: ByteImage, mask: BoolArray, core: BoolArray) -> FloatArray:
 
 def _spot_around(image: ByteImage, click: tuple[float, float]) -> BoolArray:
     h, w = image.shape[:2]
-    u, v = (int(round(float(c))) for c in click)
+    u, v = (round(float(c)) for c in click)
     where = f"({click[0]:g}, {click[1]:g})"
     if not (0 <= u < w and 0 <= v < h):
         raise InputError("click", f"a pixel (u, v) within {w} x {h}", where)
@@ -202,7 +208,9 @@ def _spot_around(image: ByteImage, click: tuple[float, float]) -> BoolArray:
     away = np.hypot(x - centre[0], y - centre[1])
     labels, _ = ndimage.label(away < 0.6 * _LEAST_CONTRAST)
     if labels[v, u] == 0:
-        raise InputError("click", "the middle of a marker", f"an edge or noise at {where}", "Click well inside a marker")
+        raise InputError(
+            "click", "the middle of a marker", f"an edge or noise at {where}", "Click well inside a marker"
+        )
     spot = labels == labels[v, u]
     if spot.sum() > _LARGEST_SHARE * h * w:
         raise InputError(
@@ -228,13 +236,19 @@ def _patch_mask(image: ByteImage, patch: object) -> BoolArray:
     array = np.asarray(patch)
     if array.dtype == bool:
         if array.shape != (h, w) or not array.any():
-            raise InputError("patch", f"a mask of shape ({h}, {w}) with marker pixels", f"shape {array.shape}, {int(array.sum())} set")
+            raise InputError(
+                "patch",
+                f"a mask of shape ({h}, {w}) with marker pixels",
+                f"shape {array.shape}, {int(array.sum())} set",
+            )
         return array
     if array.shape != (4,):
         raise InputError("patch", "a box (u0, v0, u1, v1) or a mask", f"shape {array.shape}")
     u0, v0, u1, v1 = (int(value) for value in array)
     if not (0 <= u0 < u1 <= w and 0 <= v0 < v1 <= h) or (u1 - u0) * (v1 - v0) < 4:
-        raise InputError("patch", f"a box (u0, v0, u1, v1) of at least 4 px within {w} x {h}", str((u0, v0, u1, v1)))
+        raise InputError(
+            "patch", f"a box (u0, v0, u1, v1) of at least 4 px within {w} x {h}", str((u0, v0, u1, v1))
+        )
     mask = np.zeros((h, w), dtype=bool)
     mask[v0:v1, u0:u1] = True
     return mask
@@ -243,7 +257,10 @@ def _patch_mask(image: ByteImage, patch: object) -> BoolArray:
 def histogram(x: ArrayLike, y: ArrayLike) -> FloatArray:
     """Histogram (BINS, BINS) of colours, with sum 1."""
     found, _, _ = np.histogram2d(
-        np.clip(np.ravel(x), -SPAN, SPAN), np.clip(np.ravel(y), -SPAN, SPAN), bins=BINS, range=[[-SPAN, SPAN]] * 2
+        np.clip(np.ravel(x), -SPAN, SPAN),
+        np.clip(np.ravel(y), -SPAN, SPAN),
+        bins=BINS,
+        range=[[-SPAN, SPAN]] * 2,
     )
     return np.asarray(found / max(found.sum(), 1.0))
 
@@ -254,7 +271,9 @@ def smooth(counts: FloatArray, width: float) -> FloatArray:
 
 
 # Smoothing by half the width as a matrix: twenty times faster than a filter for one blob's few pixels.
-_NARROW: FloatArray = ndimage.gaussian_filter1d(np.eye(BINS), 0.5 * WIDTH * BINS / (2.0 * SPAN), axis=0, mode="nearest")
+_NARROW: FloatArray = ndimage.gaussian_filter1d(
+    np.eye(BINS), 0.5 * WIDTH * BINS / (2.0 * SPAN), axis=0, mode="nearest"
+)
 
 
 def _sparse(counts: FloatArray) -> list[list[float]]:

@@ -15,7 +15,15 @@ from factorgrasp.models.camera import Camera
 from factorgrasp.typing import BoolArray, FloatArray
 from factorgrasp.vision.blob_depth import disc_depth
 from factorgrasp.vision.colour import ColourReference
-from factorgrasp.vision.images import LOG_LIGHT, LOG_STEPS, ByteImage, check_depth, check_rgb, chroma_index, metres
+from factorgrasp.vision.images import (
+    LOG_LIGHT,
+    LOG_STEPS,
+    ByteImage,
+    check_depth,
+    check_rgb,
+    chroma_index,
+    metres,
+)
 from factorgrasp.vision.images import middle as median
 from factorgrasp.vision.opencv import load_cv2
 from factorgrasp.vision.outline_fit import FittedCentre, fit_outline, outline_rms, split_blob
@@ -102,7 +110,10 @@ class BlobDetector:
     """
 
     def __init__(
-        self, reference: ColourReference, settings: DetectorSettings | None = None, camera: Camera | None = None
+        self,
+        reference: ColourReference,
+        settings: DetectorSettings | None = None,
+        camera: Camera | None = None,
     ) -> None:
         self.reference = reference
         self.settings = settings or DetectorSettings()
@@ -181,7 +192,11 @@ class BlobDetector:
                 continue
             corner = np.array([columns.start, rows.start], dtype=float)
             near = None if z is None else metres(z[rows, columns])
-            if table is not None and near is not None and not self._above(table, near, inside, window, corner):
+            if (
+                table is not None
+                and near is not None
+                and not self._above(table, near, inside, window, corner)
+            ):
                 rejected["on the table"] += 1
                 continue
             if table is None and s.region in ("auto", "skin") and not _on_skin(image[rows, columns][ring]):
@@ -193,7 +208,9 @@ class BlobDetector:
                 continue
             value, variance = np.nan, np.nan
             if near is not None:
-                value, variance = disc_depth(near, window & (soft.alpha > 0.5), soft.centroid, s.depth_correlation)
+                value, variance = disc_depth(
+                    near, window & (soft.alpha > 0.5), soft.centroid, s.depth_correlation
+                )
                 if table is not None and table.depth(corner + soft.centroid) - value < s.least_height:
                     rejected["on the table"] += 1
                     continue
@@ -249,7 +266,9 @@ class BlobDetector:
         if self.camera is not None and self.settings.marker_diameter > 0.0:
             known = palm_moment(candidates, self.camera, self.settings.marker_diameter)
             # Were most markers half hidden, they would agree on a size that is too small.
-            if known is not None and (expected is None or np.linalg.det(expected) < 0.6 * np.linalg.det(known)):
+            if known is not None and (
+                expected is None or np.linalg.det(expected) < 0.6 * np.linalg.det(known)
+            ):
                 expected = known
         rows: list[tuple[FloatArray, FloatArray, _Candidate, Kind]] = []
         for candidate, factor in zip(candidates, scale, strict=True):
@@ -331,8 +350,8 @@ def _components(
 ) -> tuple[Any, list[tuple[int, tuple[int, int, int, int, int]]]]:
     """Connected components: labels (h, w), and label and (left, top, width, height, area) of each, the largest first.
 
-    A component with several sure insides, or one that is too large, falls into its sure insides: markers whose edges touch, or a marker beside
-    a large thing of a similar colour.
+    A component with several sure insides, or one that is too large, falls into its sure insides: markers whose edges touch, or a
+    marker beside a large thing of a similar colour.
     """
     _, labels, stats, _ = cv2.connectedComponentsWithStatsWithAlgorithm(seeds, 8, cv2.CV_16U, cv2.CCL_BBDT)
     area = stats[:, cv2.CC_STAT_AREA]
@@ -345,7 +364,9 @@ def _components(
         box = (slice(top, top + height), slice(left, left + width))
         if count >= _SEVERAL:
             sure = ((labels[box] == label) & (seeds[box] == 2)).astype(np.uint8)
-            found, inner, parts, _ = cv2.connectedComponentsWithStatsWithAlgorithm(sure, 8, cv2.CV_16U, cv2.CCL_BBDT)
+            found, inner, parts, _ = cv2.connectedComponentsWithStatsWithAlgorithm(
+                sure, 8, cv2.CV_16U, cv2.CCL_BBDT
+            )
             sound = [i for i in range(1, found) if parts[i, cv2.CC_STAT_AREA] >= max(least, 4)]
             if (len(sound) > 1 or (count > most and sound)) and following + len(sound) < 60_000:
                 labels[box][labels[box] == label] = 0

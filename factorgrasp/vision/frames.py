@@ -1,8 +1,8 @@
 """Frames of a recording: a video, or a folder of images, each with or without a folder of depth images.
 
-Folders hold one file a frame (PNG, JPEG, TIFF, BMP), in the order of the numbers in their names. A file ``timestamps.csv`` beside the images with a column
-``t`` (one row a frame; a unit in the header, as in ``t [ms]``, is converted) gives their times; without it they follow each other at the rate. Depth images are 16-bit
-PNGs, 0 where nothing was seen, ``depth_scale`` metres a step, registered to the colours.
+Folders hold one file a frame (PNG, JPEG, TIFF, BMP), in the order of the numbers in their names. A file ``timestamps.csv`` beside the
+images with a column ``t`` (one row a frame; a unit in the header, as in ``t [ms]``, is converted) gives their times; without it they follow
+each other at the rate. Depth images are 16-bit PNGs, 0 where nothing was seen, ``depth_scale`` metres a step, registered to the colours.
 """
 
 from __future__ import annotations
@@ -76,7 +76,9 @@ class FrameSource:
             size = size or (rgb.shape[0], rgb.shape[1])
             if rgb.shape[:2] != size:
                 raise InputError(
-                    str(self.images[k]), f"the size of the first image, {size[1]} x {size[0]}", f"{rgb.shape[1]} x {rgb.shape[0]}"
+                    str(self.images[k]),
+                    f"the size of the first image, {size[1]} x {size[0]}",
+                    f"{rgb.shape[1]} x {rgb.shape[0]}",
                 )
             depth = self._depth(k, size, cv2) if self.depths else None
             yield Frame(float(self.t[k]), rgb, depth)
@@ -94,7 +96,12 @@ class FrameSource:
             for k in range(len(self)):
                 found, image = capture.read()
                 if not found:
-                    raise InputError(str(self.images[0]), f"{len(self)} frames, as the file says", f"{k}", "Is the file cut off?")
+                    raise InputError(
+                        str(self.images[0]),
+                        f"{len(self)} frames, as the file says",
+                        f"{k}",
+                        "Is the file cut off?",
+                    )
                 yield np.ascontiguousarray(image[:, :, ::-1])
         finally:
             capture.release()
@@ -116,7 +123,7 @@ class FrameSource:
                 str(path), f"the size of the colour image, {size[1]} x {size[0]}", f"{image.shape[1]} x {image.shape[0]}",
                 "Register the depth to the colour camera first",
             )  # fmt: skip
-        depth = image.astype(float) * self.depth_scale
+        depth: FloatArray = image.astype(float) * self.depth_scale
         if k == 0:
             self._check_scale(depth, path)
         return depth
@@ -127,7 +134,10 @@ class FrameSource:
             return
         middle = float(np.median(known))
         if not _PLAUSIBLE[0] <= middle <= _PLAUSIBLE[1]:
-            likely = next((s for s in (1.0, 1e-1, 1e-2, 1e-3, 2e-4, 1e-4) if 0.3 < middle / self.depth_scale * s < 3.0), None)
+            likely = next(
+                (s for s in (1.0, 1e-1, 1e-2, 1e-3, 2e-4, 1e-4) if 0.3 < middle / self.depth_scale * s < 3.0),
+                None,
+            )
             raise InputError(
                 f"{path}: depth_scale",
                 f"a median depth between {_PLAUSIBLE[0]:g} and {_PLAUSIBLE[1]:g} m",
@@ -162,7 +172,9 @@ def read_frames(
         When a path does not exist or is empty, counts differ, or times do not increase.
     """
     if (video is None) == (images is None):
-        raise InputError("frames", "a video or a folder of images", "both" if video is not None else "neither")
+        raise InputError(
+            "frames", "a video or a folder of images", "both" if video is not None else "neither"
+        )
     if not 0.0 < depth_scale < 1e3:
         raise InputError("depth_scale", "metres a step, above zero", repr(depth_scale))
     if rate is not None and not 0.0 < rate < 1e5:
@@ -187,8 +199,14 @@ def read_frames(
 
 def _image_files(folder: Path, what: str) -> tuple[Path, ...]:
     if not folder.is_dir():
-        raise InputError(f"{what}", "a folder of images", f"no folder {folder}" if not folder.exists() else f"a file, {folder}")
-    files = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and not path.name.startswith(".")]
+        raise InputError(
+            f"{what}",
+            "a folder of images",
+            f"no folder {folder}" if not folder.exists() else f"a file, {folder}",
+        )
+    files = [
+        path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
+    ]
     if not files:
         raise InputError(f"{what}: {folder}", "images (" + ", ".join(SUFFIXES) + ")", "none")
     return tuple(sorted(files, key=_natural))
@@ -196,7 +214,9 @@ def _image_files(folder: Path, what: str) -> tuple[Path, ...]:
 
 def _natural(path: Path) -> tuple[Any, ...]:
     """Order in which frame 10 follows frame 9."""
-    return tuple((0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", path.stem))
+    return tuple(
+        (0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", path.stem)
+    )
 
 
 def _timestamps(path: Path, count: int) -> FloatArray | None:
@@ -206,8 +226,14 @@ def _timestamps(path: Path, count: int) -> FloatArray | None:
     if t.size != count:
         raise InputError(str(path), f"one time for each of the {count} images", f"{t.size}")
     if not np.isfinite(t).all() or (np.diff(t) <= 0.0).any():
-        row = int(np.argmax(~np.isfinite(t))) if not np.isfinite(t).all() else int(np.argmax(np.diff(t) <= 0.0)) + 1
-        raise InputError(f"{path}: t", "finite, strictly increasing times", f"{t[row]!r} in row {row} (counted from 0)")
+        row = (
+            int(np.argmax(~np.isfinite(t)))
+            if not np.isfinite(t).all()
+            else int(np.argmax(np.diff(t) <= 0.0)) + 1
+        )
+        raise InputError(
+            f"{path}: t", "finite, strictly increasing times", f"{t[row]!r} in row {row} (counted from 0)"
+        )
     return np.asarray(t)
 
 

@@ -57,7 +57,9 @@ def check_rgb(rgb: ArrayLike, field: str = "rgb") -> ByteImage:
         hint = "Scale floats to 0..255 and cast them" if image.dtype.kind == "f" else ""
         if image.ndim == 3 and image.shape[2] == 4:
             hint = "Drop the alpha channel"
-        raise InputError(field, "8-bit colour, shape (h, w, 3), dtype uint8", f"{image.shape}, {image.dtype}", hint)
+        raise InputError(
+            field, "8-bit colour, shape (h, w, 3), dtype uint8", f"{image.shape}, {image.dtype}", hint
+        )
     if min(image.shape[:2]) < 16:
         raise InputError(field, "an image of at least 16 x 16 px", f"{image.shape[1]} x {image.shape[0]}")
     return np.ascontiguousarray(image)
@@ -80,7 +82,10 @@ def check_depth(depth: ArrayLike, size: tuple[int, int], field: str = "depth") -
     known = known[np.isfinite(known)]
     if known.size and float(np.median(known)) > 20.0:
         raise InputError(
-            field, "metres", f"a median of {np.median(known):.4g}", "Millimetres? Multiply by the depth scale, 0.001"
+            field,
+            "metres",
+            f"a median of {np.median(known):.4g}",
+            "Millimetres? Multiply by the depth scale, 0.001",
         )
     return image
 

@@ -1,7 +1,7 @@
 """Where the centre of a marker is of which a part is hidden, or that touches another one: its shape is known from the whole ones.
 
-The centroid of what is seen of a half-hidden marker is off by a fifth of its diameter. Its true edge still lies on the outline of a marker; the edge of
-what hides it lies inside of that outline.
+The centroid of what is seen of a half-hidden marker is off by a fifth of its diameter. Its true edge still lies on the outline of a
+marker; the edge of what hides it lies inside of that outline.
 """
 
 from __future__ import annotations
@@ -146,10 +146,11 @@ def split_blob(blob: SoftBlob, moment: FloatArray, count: int, blur: float = 1.3
             break
         centre = accepted + np.clip(step, -2.0, 2.0)
     noise = max(previous / max(alpha.size - 2 * count, 1), blob.alpha_variance)
-    covariance = np.linalg.inv(information + 1e-2 * np.eye(2 * count)) * noise
+    covariance: FloatArray = np.linalg.inv(information + 1e-2 * np.eye(2 * count)) * noise
     rms = float(np.sqrt(previous / alpha.size))
     return [
-        FittedCentre(accepted[i], covariance[2 * i : 2 * i + 2, 2 * i : 2 * i + 2], 1.0, rms) for i in range(count)
+        FittedCentre(accepted[i], covariance[2 * i : 2 * i + 2, 2 * i : 2 * i + 2], 1.0, rms)
+        for i in range(count)
     ]
 
 
@@ -170,7 +171,9 @@ def _spread_out(at: FloatArray, weight: FloatArray, count: int) -> FloatArray:
     return np.asarray(centre)
 
 
-def _union(at: FloatArray, centre: FloatArray, inverse: FloatArray, blur: float) -> tuple[FloatArray, FloatArray]:
+def _union(
+    at: FloatArray, centre: FloatArray, inverse: FloatArray, blur: float
+) -> tuple[FloatArray, FloatArray]:
     """Alpha (p,) of a union of soft ellipses, and its slope (p, count, 2) by their centres."""
     gap, normal = _gaps(at, centre, inverse)
     each = np.clip(0.5 - gap / blur, 0.0, 1.0)

@@ -26,8 +26,8 @@ _LEAST = 3
 def propose_colour(rgb: ArrayLike, depth: ArrayLike | None = None, count: int = 6) -> ColourReference:
     """The reference colour of the group of spots that most looks like `count` markers.
 
-    Spots are small, compact areas whose colour differs from the median around them; with depth, only what is above the table. Of the groups of
-    alike colour and size the one is taken whose number is nearest to `count`; the more distinct one of two.
+    Spots are small, compact areas whose colour differs from the median around them; with depth, only what is above the table. Of the
+    groups of alike colour and size the one is taken whose number is nearest to `count`; the more distinct one of two.
 
     Parameters
     ----------
@@ -101,7 +101,11 @@ def _find_spots(
     for label in range(1, count):
         left, top, width, height, area = (int(value) for value in stats[label])
         # A disc fills 0.79 of its box; slanted by 60 degrees, its box has sides 1 : 2.
-        if not 6 <= area <= most or max(width, height) > 2.6 * min(width, height) or area < 0.5 * width * height:
+        if (
+            not 6 <= area <= most
+            or max(width, height) > 2.6 * min(width, height)
+            or area < 0.5 * width * height
+        ):
             continue
         inside = labels[top : top + height, left : left + width] == label
         box = (slice(top, top + height), slice(left, left + width))

@@ -23,15 +23,18 @@ class AnyFrame(Protocol):
     """What a frame must have; :class:`factorgrasp.vision.Frame` does."""
 
     @property
-    def t(self) -> float: ...  # noqa: D102
+    def t(self) -> float: ...
     @property
-    def rgb(self) -> NDArray[np.uint8]: ...  # noqa: D102
+    def rgb(self) -> NDArray[np.uint8]: ...
     @property
-    def depth(self) -> FloatArray | None: ...  # noqa: D102
+    def depth(self) -> FloatArray | None: ...
 
 
 def propose_detector(
-    frames: Iterable[AnyFrame], camera: Camera | None = None, settings: DetectorSettings | None = None, looks: int = 5
+    frames: Iterable[AnyFrame],
+    camera: Camera | None = None,
+    settings: DetectorSettings | None = None,
+    looks: int = 5,
 ) -> BlobDetector:
     """A detector whose reference colour is taken from the first of `looks` frames that shows a group of alike spots.
 
@@ -120,7 +123,12 @@ def detect_recording(
 
 def _say_nothing_found(name: str, count: int, brightest: int, reasons: Counter[str]) -> None:
     if brightest < 25:
-        raise InputError(name, "images with light", f"{count} black frames (brightest value {brightest} of 255)", "Was the lens covered?")
+        raise InputError(
+            name,
+            "images with light",
+            f"{count} black frames (brightest value {brightest} of 255)",
+            "Was the lens covered?",
+        )
     raise InputError(
         name,
         "markers in at least one frame",

@@ -67,7 +67,11 @@ class DetectorSettings:
             raise InputError("detector: region", "auto, depth, skin or none", repr(self.region))
         if not 0.0 < self.threshold < 1.0 or not 0.0 <= self.least_similarity < 1.0:
             raise InputError(
-                "detector: threshold, least_similarity", "probabilities below 1", f"{self.threshold}, {self.least_similarity}"
+                "detector: threshold, least_similarity",
+                "probabilities below 1",
+                f"{self.threshold}, {self.least_similarity}",
             )
         if self.marker_diameter > 0.2:
-            raise InputError("detector: marker_diameter", "metres", f"{self.marker_diameter:g}", "Is it in millimetres?")
+            raise InputError(
+                "detector: marker_diameter", "metres", f"{self.marker_diameter:g}", "Is it in millimetres?"
+            )

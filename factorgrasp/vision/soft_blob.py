@@ -1,7 +1,7 @@
 """Sub-pixel centroids: how much of each pixel is marker, from the colours beside and inside it.
 
-A pixel on the edge is a mixture ``c = alpha m + (1 - alpha) b`` of the marker's and the surrounding colour in linear light, which is how lens and
-sensor mix them. Its share alpha is read along the direction that separates both best against the scatter of the surroundings
+A pixel on the edge is a mixture ``c = alpha m + (1 - alpha) b`` of the marker's and the surrounding colour in linear light, which is
+how lens and sensor mix them. Its share alpha is read along the direction that separates both best against the scatter of the surroundings
 (linear discriminant), whose inverse separation also is the standard deviation of alpha.
 """
 
@@ -69,7 +69,9 @@ class SoftBlob:
         return float(np.sqrt(values[1] / max(values[0], 1e-9)))
 
 
-def soften(rgb: ByteImage, inside: BoolArray, ring: BoolArray, window: BoolArray, corner: FloatArray) -> SoftBlob | None:
+def soften(
+    rgb: ByteImage, inside: BoolArray, ring: BoolArray, window: BoolArray, corner: FloatArray
+) -> SoftBlob | None:
     """The blob with the pixels `inside` of a window of the image; None when its colour does not stand out of that of the `ring`.
 
     Parameters
@@ -182,7 +184,8 @@ def bilinear(image: FloatArray, u: FloatArray, v: FloatArray) -> FloatArray:
     flat, width = padded.ravel(), w + 2
     at = i * width + j
     return np.asarray(
-        (1.0 - a) * ((1.0 - b) * flat[at] + b * flat[at + 1]) + a * ((1.0 - b) * flat[at + width] + b * flat[at + width + 1])
+        (1.0 - a) * ((1.0 - b) * flat[at] + b * flat[at + 1])
+        + a * ((1.0 - b) * flat[at + width] + b * flat[at + width + 1])
     )
 
 
