@@ -191,11 +191,38 @@ def _joint(
     constant = reward[i] - 0.5 * (
         np.einsum("ki,ki->k", rw, rw) + logdet + np.where(deep[i], 3.0, 2.0) * _LOG_2PI
     )
+    plain = _unrivalled(i, j, A, b, constant, blobs, markers)
+    if plain is not None:
+        return plain
     order = [m for m in np.argsort(np.bincount(j, minlength=markers), kind="stable") if np.any(j == m)]
     beam = _Beam(blobs)
     for marker in order:
         beam.extend(marker, np.flatnonzero(j == marker), i, A, b, constant)
     return beam.best(blobs)
+
+
+def _scores(A: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
+    """Logarithms of the joint odds of hypotheses from their sums."""
+    M = A + np.eye(6)
+    solved = np.linalg.solve(M, b[:, :, None])[:, :, 0]
+    return np.asarray(c + 0.5 * np.einsum("ki,ki->k", b, solved) - 0.5 * np.log(np.linalg.det(M)))
+
+
+def _unrivalled(
+    i: IntArray, j: IntArray, A: FloatArray, b: FloatArray, c: FloatArray, blobs: int, markers: int
+) -> Assignment | None:
+    """All pairs together, where no two share a blob or a marker and none is better left out: the usual frame."""
+    if np.bincount(i).max() > 1 or np.bincount(j).max() > 1:
+        return None
+    whole = np.concatenate([[A.sum(axis=0)], A.sum(axis=0) - A])
+    score = _scores(
+        whole, np.concatenate([[b.sum(axis=0)], b.sum(axis=0) - b]), np.append(c.sum(), c.sum() - c)
+    )
+    if score[0] < score.max():
+        return None
+    out = np.full(blobs, -1, dtype=np.intp)
+    out[i] = j
+    return Assignment(out, float(score[0]), float(score[0] - score[1:].max()))
 
 
 class _Beam:
@@ -216,9 +243,7 @@ class _Beam:
         parent, which = np.nonzero(~self.used[:, blob[pairs]])
         pair = pairs[which]
         newA, newb, newc = self.A[parent] + A[pair], self.b[parent] + b[pair], self.c[parent] + constant[pair]
-        M = newA + np.eye(6)
-        solved = np.linalg.solve(M, newb[:, :, None])[:, :, 0]
-        score = newc + 0.5 * np.einsum("ki,ki->k", newb, solved) - 0.5 * np.log(np.linalg.det(M))
+        score = _scores(newA, newb, newc)
         everything = np.concatenate([self.score, score])
         kept = np.argsort(-everything, kind="stable")[:BEAM]
         stays, grows = kept[kept < self.score.size], kept[kept >= self.score.size] - self.score.size

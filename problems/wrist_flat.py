@@ -18,7 +18,13 @@ class Flat:
 
 
 def flat_search(
-    camera: Camera, points: FloatArray, blocks: FloatArray, uvz: FloatArray, covariance: FloatArray, rates: Rates, gate: float
+    camera: Camera,
+    points: FloatArray,
+    blocks: FloatArray,
+    uvz: FloatArray,
+    covariance: FloatArray,
+    rates: Rates,
+    gate: float,
 ) -> Flat | None:
     """Not yet."""
     return None

@@ -53,7 +53,9 @@ class Pairs:
 
     def select(self, rows: IntArray) -> Pairs:
         """Some of them."""
-        return Pairs(self.node[rows], self.marker[rows], self.uvz[rows], self.root[rows], self.covariance[rows])
+        return Pairs(
+            self.node[rows], self.marker[rows], self.uvz[rows], self.root[rows], self.covariance[rows]
+        )
 
     @staticmethod
     def join(parts: list[Pairs]) -> Pairs:
@@ -109,7 +111,9 @@ def roots(covariance: FloatArray) -> FloatArray:
     return np.asarray(out)
 
 
-def predict(camera: Camera, R: FloatArray, p: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def predict(
+    camera: Camera, R: FloatArray, p: FloatArray, points: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Where markers are seen, with derivatives.
 
     Parameters
@@ -217,7 +221,9 @@ def motion_rows(
     return residual, first, second
 
 
-def transition(R: FloatArray, x: FloatArray, dt: float, motion: Motion) -> tuple[FloatArray, FloatArray, FloatArray]:
+def transition(
+    R: FloatArray, x: FloatArray, dt: float, motion: Motion
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """The node after `dt` without noise, and the derivative (D, D) of its tangent by that of the node before."""
     size = NODE_SIZE[motion]
     turn = dt * x[3:6]

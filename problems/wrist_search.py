@@ -213,7 +213,9 @@ def _judge(
     deep = root[:, 2, 2] > 0.0
     r = np.where(np.isfinite(uvz[used]), uvz[used], 0.0) - predicted.uvz[assignment.marker[used]]
     white = (root @ r[:, :, None])[:, :, 0]
-    logdet = -2.0 * np.log(np.where(root[:, [0, 1, 2], [0, 1, 2]] > 0.0, root[:, [0, 1, 2], [0, 1, 2]], 1.0)).sum()
+    logdet = (
+        -2.0 * np.log(np.where(root[:, [0, 1, 2], [0, 1, 2]] > 0.0, root[:, [0, 1, 2], [0, 1, 2]], 1.0)).sum()
+    )
     gain = float(rates.reward(deep.astype(float)).sum()) - 0.5 * (
         float(np.sum(white**2)) + logdet + float(np.sum(np.where(deep, 3.0, 2.0))) * np.log(2.0 * np.pi)
     )
@@ -224,7 +226,12 @@ def _judge(
 
 
 def prediction(
-    camera: Camera, points: FloatArray, layout_blocks: FloatArray, R: FloatArray, p: FloatArray, pose: FloatArray
+    camera: Camera,
+    points: FloatArray,
+    layout_blocks: FloatArray,
+    R: FloatArray,
+    p: FloatArray,
+    pose: FloatArray,
 ) -> Prediction:
     """Markers as a pose with covariance (6, 6) and an independent layout foretell them."""
     count = len(points)

@@ -27,7 +27,7 @@ RATE_SD = np.array([1.5, 1.5, 1.5, 0.5, 0.5, 0.5, 15.0, 15.0, 15.0, 5.0, 5.0, 5.
 _RATE_FRAMES = 30.0
 _MEMORY_FRAMES = 300.0
 _MEMORY_SECONDS = 3.0
-_DENSITY_WEIGHT = 12.0
+_DENSITY_WEIGHT = 3.0
 _DENSITY_BOUNDS = (0.03, 30.0)
 _NEAR = 1e-3
 
@@ -73,12 +73,15 @@ class Step:
     finished : list of (int, Node)
         Frames (numbers as they were pushed, from 0) whose smoothing ended with this one.
     searched : bool
+    pairs : Pairs or None
+        What was used.
     """
 
     newest: Node
     marker: IntArray
     finished: list[tuple[int, Node]]
     searched: bool
+    pairs: Pairs | None = None
 
 
 class WristTracker:
@@ -109,7 +112,13 @@ class WristTracker:
             # An exact coordinate among uncertain ones still needs a finite weight.
             prior = np.linalg.inv(markers.covariance + 1e-12 * np.eye(3 * len(markers)))
         self.window = Window(
-            camera, markers.points.copy(), prior, noise.motion, noise.densities, settings.lag, settings.loss_scale
+            camera,
+            markers.points.copy(),
+            prior,
+            noise.motion,
+            noise.densities,
+            settings.lag,
+            settings.loss_scale,
         )
         self._blocks = markers.blocks if settings.layout != "exact" else np.zeros((len(markers), 3, 3))
         self._frames: list[int] = []
@@ -166,7 +175,12 @@ class WristTracker:
         self.frame += 1
         uvz = np.concatenate([blobs.uv, blobs.depth[:, None]], axis=1)
         covariance = blob_covariances(
-            self.camera, self.noise, blobs.depth, self.usual_depth, blobs.covariance_uv, blobs.covariance_depth
+            self.camera,
+            self.noise,
+            blobs.depth,
+            self.usual_depth,
+            blobs.covariance_uv,
+            blobs.covariance_depth,
         )
         finished: list[tuple[int, Node]] = []
         if self.tracking and blobs.t - self.last_used > self.association.lost_after:
@@ -221,7 +235,7 @@ class WristTracker:
             self.last_used = t
         self._count(marker, predicted)
         newest = self._newest(t, used, ambiguous)
-        return Step(newest, marker + 1, finished, searched)
+        return Step(newest, marker + 1, finished, searched, pairs)
 
     def _seek(
         self, t: float, uvz: FloatArray, covariance: FloatArray, finished: list[tuple[int, Node]]
@@ -244,12 +258,13 @@ class WristTracker:
         self.window.start(t, found.R, found.p, POSE_SD, RATE_SD)
         marker = found.assignment.marker
         x = self.window.x[-1]
-        self.window.refresh(self._pairs(uvz, covariance, marker, found.R, x))
+        pairs = self._pairs(uvz, covariance, marker, found.R, x)
+        self.window.refresh(pairs)
         self.tracking = self.found = True
         self.last_used, self._poor = t, 0
         ambiguous = self._doubt(found.R, x, uvz, covariance, marker)
         self._frames, self._flags = [self.frame], [(True, ambiguous)]
-        return Step(self._newest(t, True, ambiguous), marker + 1, finished, True)
+        return Step(self._newest(t, True, ambiguous), marker + 1, finished, True, pairs)
 
     def flush(self) -> list[tuple[int, Node]]:
         """What is still in the lag, smoothed as far as it will be."""
@@ -287,7 +302,9 @@ class WristTracker:
         if self.settings.layout == "noise" and used.size:
             points = self.window.layout[marker[used]]
             shape = (used.size, 3, 3)
-            J = predict(self.camera, np.broadcast_to(R, shape), np.broadcast_to(x[:3], (used.size, 3)), points)[2]
+            J = predict(
+                self.camera, np.broadcast_to(R, shape), np.broadcast_to(x[:3], (used.size, 3)), points
+            )[2]
             C = C + J @ self._blocks[marker[used]] @ np.swapaxes(J, 1, 2)
         node = np.zeros(used.size, dtype=np.intp)
         values = np.where(np.isfinite(uvz[used]), uvz[used], 0.0)
@@ -301,7 +318,15 @@ class WristTracker:
         support, gate = self.association.support, self.association.gate
         if len(uvz) >= support:
             found = search(
-                self.camera, self.window.layout, self._blocks, uvz, covariance, self.rates, support, gate, guess
+                self.camera,
+                self.window.layout,
+                self._blocks,
+                uvz,
+                covariance,
+                self.rates,
+                support,
+                gate,
+                guess,
             )
             if found is not None:
                 return found
@@ -373,7 +398,14 @@ class WristTracker:
             n, s = self.size, self.window.shared
             unknown = np.full((n, n), np.inf)
             return Node(
-                t, np.full((3, 3), np.nan), np.full(n - 3, np.nan), unknown, np.zeros((n, s)), True, False, False
+                t,
+                np.full((3, 3), np.nan),
+                np.full(n - 3, np.nan),
+                unknown,
+                np.zeros((n, s)),
+                True,
+                False,
+                False,
             )
         R, x, P = self.window.predicted(t)
         s = self.window.shared
@@ -396,7 +428,16 @@ class WristTracker:
             out.append(
                 (
                     self._frames.pop(0),
-                    Node(t, leaving.R, leaving.x, leaving.covariance, leaving.with_layout, False, used, ambiguous),
+                    Node(
+                        t,
+                        leaving.R,
+                        leaving.x,
+                        leaving.covariance,
+                        leaving.with_layout,
+                        False,
+                        used,
+                        ambiguous,
+                    ),
                 )
             )
         return out

@@ -26,8 +26,9 @@ from factorgrasp.problems.wrist_model import (
 from factorgrasp.problems.wrist_settings import Motion
 from factorgrasp.typing import FloatArray
 
-_SMALL_STEP = 0.02
-"""Largest step, in standard deviations, that ends the iterations of a frame: a fiftieth changes no decision."""
+_SMALL_STEP = 0.6
+"""Length of the step of all unknowns together, in standard deviations, after which no other is made: steps shrink by
+about six, so a tenth is left over a hundred unknowns, and the next frame goes on."""
 _MOST_STEPS = 4
 
 
@@ -152,7 +153,9 @@ class Window:
         out[k:, k:] = F @ P[k:, k:] @ F.T + process_covariance(dt, self.densities, self.motion)
         return R, x, out
 
-    def push(self, t: float, pairs: Pairs, R: FloatArray | None = None, x: FloatArray | None = None) -> Leaving | None:
+    def push(
+        self, t: float, pairs: Pairs, R: FloatArray | None = None, x: FloatArray | None = None
+    ) -> Leaving | None:
         """Add a frame at its predicted pose (or at `R`, `x`), smooth, and let the oldest node go when the lag is full."""
         if R is None or x is None:
             R, x, _ = self.predicted(t)
@@ -212,36 +215,24 @@ class Window:
         if not counts.any():
             self.weights = np.empty(0)
             return
-        all_pairs = Pairs.join([p for p in self.pairs if len(p)])
+        pairs = Pairs.join([p for p in self.pairs if len(p)])
         node = np.repeat(np.arange(counts.size), counts)
-        r, J_pose, J_point = self._marker_rows(all_pairs, node)
-        weight = self._weights(r)
-        self.weights = weight
-        scale = np.sqrt(weight)[:, None]
-        r, J_pose, J_point = r * scale, J_pose * scale[:, :, None], J_point * scale[:, :, None]
-        s, D = self.shared, self.size
-        ends = np.cumsum(counts)
-        # Rows of a frame as one block: (3 markers x 6) and its product with the layout's columns.
-        for k in np.flatnonzero(counts):
-            rows = slice(ends[k] - counts[k], ends[k])
-            a = s + k * D
-            A = J_pose[rows].reshape(-1, 6)
-            b = r[rows].ravel()
-            H[a : a + 6, a : a + 6] += A.T @ A
-            g[a : a + 6] -= A.T @ b
-            if s:
-                cross = np.swapaxes(J_point[rows], 1, 2) @ J_pose[rows]
-                where = (3 * all_pairs.marker[rows, None] + np.arange(3)).ravel()
-                block = cross.reshape(-1, 6)
-                H[where, a : a + 6] += block
-                H[a : a + 6, where] += block.T
+        r, J_pose, J_point = self._marker_rows(pairs, node)
+        self.weights = self._weights(r)
+        scale = np.sqrt(self.weights)
+        s, D, M = self.shared, self.size, node.size
+        # Columns of the rows: the layout, then the six of every node's pose; one product makes all blocks.
+        A = np.zeros((M, 3, s + 6 * counts.size + 1))
+        rows, axes, six = np.arange(M)[:, None], np.arange(3), np.arange(6)
         if s:
-            gram = np.swapaxes(J_point, 1, 2) @ J_point
-            right = (np.swapaxes(J_point, 1, 2) @ r[:, :, None])[:, :, 0]
-            for j in np.unique(all_pairs.marker):
-                mine = all_pairs.marker == j
-                H[3 * j : 3 * j + 3, 3 * j : 3 * j + 3] += gram[mine].sum(axis=0)
-                g[3 * j : 3 * j + 3] -= right[mine].sum(axis=0)
+            A[rows, :, 3 * pairs.marker[:, None] + axes] = np.swapaxes(J_point * scale[:, None, None], 1, 2)
+        A[rows, :, s + 6 * node[:, None] + six] = np.swapaxes(J_pose * scale[:, None, None], 1, 2)
+        A[:, :, -1] = r * scale[:, None]
+        flat = A.reshape(3 * M, -1)
+        gram = flat.T @ flat
+        columns = np.concatenate([np.arange(s), (s + D * np.arange(counts.size)[:, None] + six).ravel()])
+        H[columns[:, None], columns] += gram[:-1, :-1]
+        g[columns] -= gram[:-1, -1]
 
     def _marker_rows(self, pairs: Pairs, node: np.ndarray) -> tuple[FloatArray, FloatArray, FloatArray]:
         uvz, J_pose, J_point = predict(self.camera, self.R[node], self.x[node, :3], self.layout[pairs.marker])
@@ -304,7 +295,9 @@ class Window:
         return out
 
     def _transition_fit(self, P: FloatArray) -> tuple[FloatArray, FloatArray]:
-        residual, first, second = motion_rows(self.R[:2], self.x[:2], np.array([self.t[1] - self.t[0]]), self.motion)
+        residual, first, second = motion_rows(
+            self.R[:2], self.x[:2], np.array([self.t[1] - self.t[0]]), self.motion
+        )
         root = self._roots[0]
         r = root @ residual[0]
         J = root @ np.concatenate([first[0], second[0]], axis=1)
@@ -330,7 +323,13 @@ class Window:
         self.left = self.t[0]
         self.t, self.pairs, self._roots = self.t[1:], self.pairs[1:], self._roots[1:]
         self.R, self.x = self.R[1:], self.x[1:]
-        self.prior = Prior(self.R[0].copy(), self.x[0].copy(), self.layout.copy(), 0.5 * (information + information.T), vector)
+        self.prior = Prior(
+            self.R[0].copy(),
+            self.x[0].copy(),
+            self.layout.copy(),
+            0.5 * (information + information.T),
+            vector,
+        )
 
 
 def _no_pairs() -> Pairs:
