@@ -107,4 +107,5 @@ def write_all(
     (directory / REPORT_NAME).unlink(missing_ok=True)
     estimate.save(directory)
     report = write_report(estimate, directory / REPORT_NAME, title, source, remarks)
-    return [directory / JSON_NAME, directory / NPZ_NAME, report]
+    extra = [directory / name for name in getattr(estimate, "extra_files", ())]
+    return [directory / JSON_NAME, directory / NPZ_NAME, *extra, report]

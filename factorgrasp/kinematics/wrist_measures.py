@@ -1,0 +1,136 @@
+"""What the paper wants a wrist's track for: angles, ranges of motion, speeds and movements, each with its uncertainty."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from factorgrasp.kinematics.angles import (
+    AXES,
+    ISB_NAMES,
+    OPPOSITES,
+    Hand,
+    angle_covariance,
+    isb_signs,
+    wrist_angles,
+)
+from factorgrasp.kinematics.measure import Measure, measured
+from factorgrasp.kinematics.range_of_motion import RangeOfMotion, range_of_motion
+from factorgrasp.kinematics.reaching import BANDWIDTH, Movement, movements, on_clock
+from factorgrasp.kinematics.smoothness import low_pass
+from factorgrasp.kinematics.track_errors import SAMPLES, sample_tracks
+from factorgrasp.typing import FloatArray, JsonDict
+
+if TYPE_CHECKING:
+    from factorgrasp.problems.wrist_track import WristTrack
+
+_FEWEST = 8
+
+
+@dataclass(frozen=True, eq=False)
+class WristMeasures:
+    """Kinematic measures of one track.
+
+    Attributes
+    ----------
+    hand : {"right", "left"}
+    angles, angles_sd : ndarray, shape (n, 3)
+        Flexion, ulnar deviation, pronation against the start posture (rad), positive in the direction of their names; NaN where lost.
+    range_of_motion : tuple of RangeOfMotion
+        Flexion/extension, radial/ulnar deviation, pronation/supination; empty when the track is too short.
+    peak_angular_speed, peak_speed : Measure
+        Largest speed of turning (rad/s) and of the wrist's marker (m/s), of the motion up to 4 Hz.
+    movements : tuple of Movement
+        Ways of 50 mm and more from rest to rest.
+    words : tuple of str
+        What limits the figures.
+    """
+
+    hand: Hand
+    angles: FloatArray
+    angles_sd: FloatArray
+    range_of_motion: tuple[RangeOfMotion, ...]
+    peak_angular_speed: Measure
+    peak_speed: Measure
+    movements: tuple[Movement, ...]
+    words: tuple[str, ...] = ()
+
+    def to_dict(self) -> JsonDict:
+        """Plain numbers (rad, m, s)."""
+        return {
+            "hand": self.hand,
+            "range_of_motion": {one.axis: one.to_dict() for one in self.range_of_motion},
+            "peak_angular_speed": self.peak_angular_speed.to_dict(),
+            "peak_speed": self.peak_speed.to_dict(),
+            "movements": [one.to_dict() for one in self.movements],
+            "words": list(self.words),
+        }
+
+
+def wrist_measures(
+    track: WristTrack, hand: Hand = "right", samples: int = SAMPLES, seed: int = 0
+) -> WristMeasures:
+    """Measures of a track; smoothed ones only, for a filter's noise makes ranges of motion 2 to 3 degrees too large.
+
+    Parameters
+    ----------
+    track : WristTrack
+    hand : {"right", "left"}
+        Decides the signs of deviation and pronation.
+    samples : int
+        Tracks that are drawn for the standard deviations.
+    seed : int
+        Of the draws: the same track gives the same numbers.
+    """
+    R = track.rotation
+    P = np.where(np.isfinite(track.covariance), track.covariance, np.nan)
+    signs = isb_signs(hand)
+    angles = signs * wrist_angles(R)
+    variance = np.einsum("nii->ni", angle_covariance(R, P[:, :3, :3]))
+    sd = np.sqrt(np.maximum(variance, 0.0))
+    known = np.isfinite(angles).all(axis=1) & np.isfinite(sd).all(axis=1)
+    unknown = Measure(float("nan"), float("nan"), "")
+    if known.sum() < _FEWEST:
+        few = f"only {int(known.sum())} frames have a pose: too few for kinematic measures"
+        return WristMeasures(hand, angles, sd, (), unknown, unknown, (), (few,))
+    words: list[str] = []
+    if track.delay >= 0:
+        words.append(
+            "the track is not smoothed over the whole recording: its noise makes ranges of motion too large"
+        )
+    drawn = sample_tracks(
+        track.t, R, track.position, track.velocity, track.angular_velocity, P, track.velocity_covariance,
+        samples, seed,
+    )  # fmt: skip
+    drawn_angles = signs * wrist_angles(drawn.rotation)
+    ranges = tuple(
+        range_of_motion(
+            track.t, angles[:, i], sd[:, i], drawn_angles[..., i], AXES[i], (ISB_NAMES[i], OPPOSITES[i])
+        )
+        for i in range(3)
+    )
+    return WristMeasures(
+        hand,
+        angles,
+        sd,
+        ranges,
+        _peak(track.t, track.angular_velocity, drawn.angular_velocity, "rad/s"),
+        _peak(track.t, track.velocity, drawn.velocity, "m/s"),
+        movements(track.t, track.position, track.velocity, drawn.position, drawn.velocity),
+        tuple(words),
+    )
+
+
+def _peak(t: FloatArray, values: FloatArray, drawn: FloatArray, unit: str) -> Measure:
+    """Largest norm of a vector signal below the bandwidth, less what noise adds to it."""
+    dt = float(np.median(np.diff(t)))
+    clock = np.arange(t[0], t[-1] + 1e-9, dt)
+    slow = low_pass(on_clock(clock, t, np.concatenate([values[None], drawn])), 1.0 / dt, BANDWIDTH)
+    size = np.linalg.norm(slow, axis=2)
+    if not np.isfinite(size[0]).any():
+        return Measure(float("nan"), float("nan"), unit)
+    at = int(np.nanargmax(size[0]))
+    added = float(np.nanmean(size[1:, at]) - size[0, at])
+    return measured(size[0, at] - added, size[1:, at], unit)

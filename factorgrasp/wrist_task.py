@@ -1,0 +1,253 @@
+"""A wrist recording with everything that one wants from it: the problem, the way to smooth it, and the measures of the track."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from typing import Any, Literal, cast
+
+import numpy as np
+
+from factorgrasp.errors import NotSolvedError
+from factorgrasp.estimate import Estimate
+from factorgrasp.kinematics.angles import Hand
+from factorgrasp.kinematics.wrist_measures import wrist_measures
+from factorgrasp.least_squares import LeastSquares
+from factorgrasp.models.camera import Camera
+from factorgrasp.models.markers import MarkerLayout
+from factorgrasp.problems.wrist_estimate import WristPoseEstimate, find_gaps, lost_frames, make_track
+from factorgrasp.problems.wrist_frames import StartFrame
+from factorgrasp.problems.wrist_model import Pairs, blob_covariances, roots
+from factorgrasp.problems.wrist_pose import FirstPass, WristPose, track_forward
+from factorgrasp.problems.wrist_settings import WristAssociation, WristNoise, WristSettings
+from factorgrasp.problems.wrist_track import CameraPose, WristTrack
+from factorgrasp.problems.wrist_tracker import Node
+from factorgrasp.provenance import versions
+from factorgrasp.recordings.blobs import BlobRecording
+from factorgrasp.status import Status
+from factorgrasp.typing import FloatArray, State
+from factorgrasp.wrist_result import WristResult
+
+MOST_AMBIGUOUS = 0.2
+"""Share of the frames that may be ambiguous before the answer as a whole is."""
+LEAST_FOUND = 0.5
+"""Share of the frames in which the hand has to be found."""
+
+
+class WristTask:
+    """What ``kind = "wrist_pose"`` of a problem file states.
+
+    Parameters
+    ----------
+    camera : Camera
+    blobs : BlobRecording
+    markers : MarkerLayout
+    association, noise, settings, camera_pose
+        As for :class:`factorgrasp.problems.WristPose`.
+    method : {"batch", "fixed_lag", "filter"}
+        Smoothed over the whole recording; or each frame as it is known `settings.lag` frames later, or at once.
+    hand : {"right", "left"}
+    remarks : sequence of str
+        What the reader of the recording noticed.
+    """
+
+    kind = "wrist_pose"
+
+    def __init__(
+        self,
+        camera: Camera,
+        blobs: BlobRecording,
+        markers: MarkerLayout,
+        *,
+        association: WristAssociation | None = None,
+        noise: WristNoise | None = None,
+        settings: WristSettings | None = None,
+        camera_pose: CameraPose | None = None,
+        method: Literal["batch", "fixed_lag", "filter"] = "batch",
+        hand: Hand = "right",
+        remarks: tuple[str, ...] = (),
+    ) -> None:
+        self.problem = WristPose(camera, blobs, markers, association, noise, settings, camera_pose)
+        self.method, self.hand, self.remarks = method, hand, tuple(remarks)
+
+    def solve(self, solver: str | None = None) -> WristResult:
+        """Track, smooth and measure.
+
+        Parameters
+        ----------
+        solver : str, optional
+            Of the batch; a filter and a fixed lag have their own.
+
+        Returns
+        -------
+        WristResult
+            Also when the hand was not found, with the reason.
+        """
+        from factorgrasp.solvers.solve import solve
+
+        try:
+            if self.method == "batch":
+                solved = cast(WristPoseEstimate, solve(self.problem, solver))
+            else:
+                solved = self._forward()
+        except NotSolvedError as error:
+            solved = self._nothing(str(error))
+        measures = wrist_measures(solved.track, self.hand)
+        warnings = [*self.remarks, *solved.warnings, *seen_from_behind(solved.track), *measures.words]
+        status, message = self._judged(solved)
+        estimate = replace(solved.estimate, status=status, message=message)
+        return WristResult(
+            estimate,
+            solved,
+            measures,
+            self.problem.blobs,
+            self.problem.camera,
+            self.hand,
+            self.method,
+            tuple(dict.fromkeys(warnings)),
+        )
+
+    # ---- for the comparison of solvers: the batch
+
+    def initial_state(self) -> State:
+        """As for :class:`factorgrasp.problems.WristPose`, and so the three below."""
+        return self.problem.initial_state()
+
+    def linearize(self, state: State) -> LeastSquares:
+        """The rows of the batch."""
+        return self.problem.linearize(state)
+
+    def retract(self, state: State, step: FloatArray) -> State:
+        """Move the state."""
+        return self.problem.retract(state, step)
+
+    def view(self, estimate: Estimate) -> WristPoseEstimate:
+        """The track of a solution."""
+        return self.problem.view(estimate)
+
+    def factor_graph(self, state: State | None = None) -> Any:
+        """The batch as ``gtsam.NonlinearFactorGraph``."""
+        return self.problem.factor_graph(state)
+
+    def graph_values(self, state: State) -> Any:
+        """A state as ``gtsam.Values``."""
+        return self.problem.graph_values(state)
+
+    def graph_state(self, values: Any) -> State:
+        """``gtsam.Values`` as a state."""
+        return self.problem.graph_state(values)
+
+    # ---- a filter and a fixed lag
+
+    def _forward(self) -> WristPoseEstimate:
+        """The track as an online estimator gives it, newest or lagged."""
+        problem = self.problem
+        started = time.perf_counter()
+        first, newest = track_forward(
+            problem.camera, problem.blobs, problem.markers, problem.association, problem.noise, problem.settings
+        )
+        elapsed = time.perf_counter() - started
+        problem.__dict__["first_pass"] = first
+        if not any(node.used for node in first.nodes):
+            raise NotSolvedError(problem._why_nothing())
+        nodes = first.nodes if self.method == "fixed_lag" else newest
+        used = np.array([node.used for node in newest])
+        gaps = find_gaps(problem.blobs.t, used, problem.association.lost_after)
+        markers = MarkerLayout(problem.markers.names, first.layout, problem.markers.covariance)
+        start = problem.camera_pose or self._start_frame(first, first.nodes, markers)
+        track = make_track(
+            nodes,
+            start,
+            first.marker,
+            gaps,
+            markers,
+            lost_frames(problem.blobs.t, gaps, nodes),
+            problem.settings.lag if self.method == "fixed_lag" else 0,
+        )
+        estimate = self._estimate(Status.SOLVED, "", "tracker", {"solve": elapsed})
+        nan = float("nan")
+        densities = np.sqrt(first.densities)
+        return WristPoseEstimate(
+            estimate, track, first.detection, first.clutter, nan, nan, float(densities[0]), float(densities[1]), nan, nan
+        )  # fmt: skip
+
+    def _start_frame(self, first: FirstPass, nodes: tuple[Node, ...], markers: MarkerLayout) -> CameraPose:
+        problem = self.problem
+        blobs = problem.blobs
+        start = StartFrame(
+            problem.camera, markers.points, markers.covariance, problem.settings.start_frames
+        )
+        usual = float(np.nanmedian(blobs.depth)) if np.isfinite(blobs.depth).any() else 0.8
+        C = blob_covariances(
+            problem.camera, problem.noise, blobs.depth, usual, blobs.covariance_uv, blobs.covariance_depth
+        )
+        for k, node in enumerate(nodes):
+            rows = np.arange(len(blobs.frame))[blobs.rows(k)]
+            rows = rows[first.marker[rows] > 0]
+            if not node.used or rows.size < 3:
+                continue
+            uvz = np.nan_to_num(np.concatenate([blobs.uv[rows], blobs.depth[rows, None]], axis=1))
+            zeros = np.zeros(rows.size, dtype=np.intp)
+            pairs = Pairs(zeros, first.marker[rows] - 1, uvz, roots(C[rows]), C[rows])
+            start.add(float(blobs.t[k]), pairs, node.R, node.x[:3])
+            if start.closed:
+                break
+        if start.pose is None:
+            raise NotSolvedError("no frame shows three markers at once: the start posture is not known")
+        return start.pose
+
+    # ---- what came of it
+
+    def _estimate(self, status: Status, message: str, solver: str, timing: dict[str, float]) -> Estimate:
+        return Estimate(
+            status, self.kind, solver, (), {}, message, timing=timing, versions=versions(("gtsam", "qdldl"))
+        )
+
+    def _nothing(self, reason: str) -> WristPoseEstimate:
+        """A track in which nothing is known, so that the reason is written like any other answer."""
+        problem = self.problem
+        n = len(problem.blobs)
+        unknown = np.full((n, 6, 6), np.inf)
+        no = np.zeros(n, dtype=bool)
+        nowhere = CameraPose(np.full((3, 3), np.nan), np.full(3, np.nan), np.full((6, 6), np.nan))
+        track = WristTrack(
+            problem.blobs.t, np.full((n, 4), np.nan), *(np.full((n, 3), np.nan) for _ in range(3)), unknown, unknown.copy(),
+            np.zeros(problem.blobs.frame.size, dtype=np.intp), ~no, no, (), problem.markers, nowhere,
+        )  # fmt: skip
+        estimate = self._estimate(Status.UNOBSERVABLE, reason, "tracker", {})
+        nan = float("nan")
+        clutter = problem.blobs.frame.size / max(n, 1)
+        return WristPoseEstimate(estimate, track, 0.0, clutter, nan, nan, nan, nan, nan, nan)
+
+    def _judged(self, solved: WristPoseEstimate) -> tuple[Status, str]:
+        """Whether the track as a whole answers the question."""
+        status, message = solved.estimate.status, solved.estimate.message
+        track = solved.track
+        if not status.ok:
+            return status, message
+        ambiguous = float(np.mean(track.ambiguous[~track.lost])) if not track.lost.all() else 0.0
+        if ambiguous > MOST_AMBIGUOUS:
+            return Status.UNOBSERVABLE, (
+                f"the orientation is ambiguous in {100.0 * ambiguous:.0f} % of the frames: without depth two poses explain the pixels of "
+                "nearly coplanar markers; give depths (z), or markers that are not in one plane"
+            )
+        found = 1.0 - float(np.mean(track.lost))
+        if found < LEAST_FOUND:
+            return Status.UNOBSERVABLE, (
+                f"the hand was found in {100.0 * found:.0f} % of the frames only; check the layout, the units of the depth and the intrinsics"
+            )
+        return status, message
+
+
+def seen_from_behind(track: WristTrack) -> tuple[str, ...]:
+    """A word when the markers are on the far side of the hand, which no camera can see."""
+    seen = ~track.lost
+    if not seen.any():
+        return ()
+    towards = np.einsum("ni,ni->n", track.camera_rotation[seen][:, :, 2], track.camera_position[seen])
+    if np.mean(towards > 0.0) < 0.5:
+        return ()
+    return (
+        "the markers are on the side of the hand that the camera cannot see: are the columns u and v swapped, or is the layout that of "
+        "the other hand, or its z axis not out of the back of the hand?",
+    )
