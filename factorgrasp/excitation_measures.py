@@ -151,7 +151,7 @@ def window_measures(
     t : (n,) array_like
         s, uniform.
     angular_velocity, angular_acceleration : (n, 3) array_like
-        rad/s and rad/s^2, end-effector frame; windows that touch a row with NaN are left out.
+        rad/s and rad/s^2, end-effector frame. A row with NaN is a gap: it counts as no excitation.
     window : float
         T, s. Longer than the motion: the whole of it is the only window.
     centred : bool
@@ -166,7 +166,7 @@ def window_measures(
     Raises
     ------
     InputError
-        For a window of less than two samples, or when every window touches a gap.
+        For a window of less than two samples, or when nothing but gaps is there.
     """
     stamps = np.asarray(t, dtype=float)
     step = float((stamps[-1] - stamps[0]) / (stamps.size - 1))
@@ -176,33 +176,27 @@ def window_measures(
     phi = phi_parts(angular_velocity, angular_acceleration)
     bad: BoolArray = np.asarray(~np.isfinite(phi).all(axis=(1, 2)))
     phi[bad] = 0.0
+    if bad.all():
+        raise InputError("motion", "rows of numbers", "gaps only")
     # Trapezoidal sums: a window of n samples has n - 1 steps, and its two ends count half.
     square = np.matmul(phi.transpose(0, 2, 1), phi)
     G, mean = _windowed(square, length) * step, _windowed(phi, length) * step
-    clean: BoolArray = _windowed(bad[:, None, None].astype(float), length)[:, 0, 0] == 0.0
-    if not clean.any():
-        raise InputError(
-            "window",
-            "at least one window without a gap",
-            f"none of {window:g} s",
-            "Take a shorter window, or a recording with fewer gaps",
-        )
-    span = length * step
+    seconds = np.maximum(_windowed((~bad)[:, None, None].astype(float), length) * step, 1e-12)
     if centred:
-        G -= np.matmul(mean.transpose(0, 2, 1), mean) / span
-    expected = np.zeros((3, 3)) if noise is None else span * np.asarray(noise)
-    G = G[clean] - expected
+        G -= np.matmul(mean.transpose(0, 2, 1), mean) / seconds
+    expected = np.zeros((3, 3)) if noise is None else np.asarray(noise)
+    G -= seconds * expected
     values, vectors = np.linalg.eigh(0.5 * (G + G.transpose(0, 2, 1)))
     weakest = vectors[:, :, 0]
     largest = np.take_along_axis(weakest, np.argmax(np.abs(weakest), axis=1)[:, None], axis=1)
     return WindowMeasures(
-        start=stamps[: clean.size][clean],
-        window=span,
+        start=stamps[: G.shape[0]],
+        window=length * step,
         matrix=G,
         eigenvalues=values,
         weakest=weakest * np.where(largest < 0.0, -1.0, 1.0),
         centred=centred,
-        noise=float(np.trace(expected) / 3.0),
+        noise=float(np.trace(expected) / 3.0 * length * step),
     )
 
 
