@@ -20,6 +20,7 @@ Builder: TypeAlias = Callable[[Mapping[str, Any], Path], Problem]
 KINDS: dict[str, str] = {
     "grasp_pose": "factorgrasp.grasp_file:build",
     "human_dynamics": "factorgrasp.human_dynamics_file:build",
+    "excitation": "factorgrasp.excitation_file:build",
     "wrist_pose": "factorgrasp.wrist_file:build",
 }
 """``"module:function"`` of the builder of every kind, imported when it is needed."""

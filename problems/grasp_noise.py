@@ -72,7 +72,7 @@ def noise_moments(
     cross = (robot.force_by_acceleration / step)[:, None, None] * lie.skew(mean_force)
     out[:, 0:3, 3:6] = cross
     out[:, 3:6, 0:3] = cross.transpose(0, 2, 1)
-    out[:, 6:12, 6:12] = (robot.angular_velocity / step)[:, None, None] * _product_noise(rate_moment)
+    out[:, 6:12, 6:12] = (robot.angular_velocity / step)[:, None, None] * product_noise(rate_moment)
     out[:, 15:18, 15:18] = (hand.accelerometer_density**2 / step * slope_gain)[:, None, None] * eye
     return NoiseMoments(
         gyro=gyro,
@@ -82,8 +82,8 @@ def noise_moments(
     )
 
 
-def _product_noise(W: FloatArray) -> FloatArray:
-    """Covariance (6, 6) of ``vech(w n' + n w')`` for white unit noise n and ``E[w w'] = W``."""
+def product_noise(W: FloatArray) -> FloatArray:
+    """Covariance (6, 6) of ``vech(w n' + n w')`` for white unit noise n (3,) and ``E[w w'] = W`` (3, 3)."""
     out = np.zeros((6, 6))
     eye = np.eye(3)
     for a, (i, j) in enumerate(VECH):
