@@ -38,6 +38,8 @@ class HumanDynamicsEstimate:
         (n, J, 3, 3).
     joint_wrench, joint_wrench_sd : ndarray
         (n, J, 6) ``[force; moment]`` in the child's frame.
+    joint_wrench_covariance : ndarray
+        (n, J, 6, 6).
     external_wrench, external_wrench_sd : ndarray
         (n, L, 6) net external wrench on every link in its frame.
     external_wrench_covariance : ndarray
@@ -70,6 +72,7 @@ class HumanDynamicsEstimate:
     joint_moment_covariance: FloatArray
     joint_wrench: FloatArray
     joint_wrench_sd: FloatArray
+    joint_wrench_covariance: FloatArray
     external_wrench: FloatArray
     external_wrench_sd: FloatArray
     external_wrench_covariance: FloatArray
@@ -203,6 +206,7 @@ def read_frames(problem: HumanDynamics, result: Any) -> HumanDynamicsEstimate:
         else _nothing(count, joints, 3, 3),
         joint_wrench=wrench,
         joint_wrench_sd=_at(sd, columns.joint_wrench, count),
+        joint_wrench_covariance=P_joint,
         external_wrench=x[:, columns.external_wrench.ravel()].reshape(count, links, 6),
         external_wrench_sd=_at(sd, columns.external_wrench, count),
         external_wrench_covariance=P_link,
