@@ -69,6 +69,19 @@ def _read(path: str | Path, needed: tuple[str, ...]) -> dict[str, Any]:
         raise InputError(str(file), "an archive of link-level arrays (.npz)", str(error)) from error
 
 
+def load_coordinates(path: str | Path) -> dict[str, tuple[FloatArray, FloatArray]]:
+    """Coordinates of an archive of links: name to value (n,) and rate (n,), rad or m and per second.
+
+    Raises
+    ------
+    InputError
+        When the archive has none.
+    """
+    data = _read(path, ("names", "Q", "dQ"))
+    names, Q, dQ = data["names"], data["Q"], data["dQ"]
+    return {str(name): (np.asarray(Q[:, i], dtype=float), np.asarray(dQ[:, i], dtype=float)) for i, name in enumerate(names)}
+
+
 def load_links(
     path: str | Path,
     gravity: tuple[float, float, float] = (0.0, -9.80665, 0.0),
