@@ -27,9 +27,14 @@ def load_coordinates(path: str | Path) -> dict[str, tuple[FloatArray, FloatArray
     with np.load(path, allow_pickle=False) as archive:
         missing = [name for name in ("names", "Q", "dQ") if name not in archive]
         if missing:
-            raise InputError(str(Path(path).name), "coordinates: the fields names, Q, dQ", "no " + ", ".join(missing))
+            raise InputError(
+                str(Path(path).name), "coordinates: the fields names, Q, dQ", "no " + ", ".join(missing)
+            )
         names, Q, dQ = (archive[name] for name in ("names", "Q", "dQ"))
-    return {str(name): (np.asarray(Q[:, i], dtype=float), np.asarray(dQ[:, i], dtype=float)) for i, name in enumerate(names)}
+    return {
+        str(name): (np.asarray(Q[:, i], dtype=float), np.asarray(dQ[:, i], dtype=float))
+        for i, name in enumerate(names)
+    }
 
 
 def load_links(
