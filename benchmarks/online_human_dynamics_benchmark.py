@@ -2,9 +2,12 @@
 
     OMP_NUM_THREADS=1 python benchmarks/online_human_dynamics_benchmark.py [--frames 360000] [--quick] [--out benchmarks/results]
 
-The 23-segment body (66 degrees of freedom) walks with a load in both hands; plates under the feet, 17 accelerometers, unmeasured hands; torques and
-wrenches come with covariances. 360 000 frames are an hour at 100 Hz, fed one after another without waiting, the recording over and over, and each
-time with other dropouts: single values, whole sensors for a while, both plates at once, and frames without motion. Ends with exit code 1 when a
+The 23-segment body (66 degrees of freedom) walks with a load in both hands; plates under the feet, 17
+accelerometers, unmeasured hands; torques and
+wrenches come with covariances. 360 000 frames are an hour at 100 Hz, fed one after another without waiting, the
+recording over and over, and each
+time with other dropouts: single values, whole sensors for a while, both plates at once, and frames without motion.
+Ends with exit code 1 when a
 target is missed. About ten minutes; ``--quick`` half a minute.
 
 Limits: one machine, and whatever else it does: latency is wall time, as a controller would see it, beside the processor's.

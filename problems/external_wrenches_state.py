@@ -126,8 +126,7 @@ def _spread(
 
 
 def link_jacobians(tree: BodyTree, k: LinkKinematics, size: int) -> tuple[FloatArray, FloatArray]:
-    """``J_i`` and ``d alpha_i / d delta`` (n, L, 6, k): twists and proper accelerations of links in their frames by
-    errors of the configuration.
+    """Twists and proper accelerations of links by errors of the configuration: ``J_i``, ``d alpha_i / d delta``, (n, L, 6, k).
 
     By errors of the accelerations it is ``d alpha_i / d eps = J_i``.
     """

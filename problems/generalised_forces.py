@@ -1,11 +1,13 @@
 """Generalised forces of coordinates that joints do not turn about a fixed axis by: a knee that slides while it bends.
 
-The power of a joint's wrench ``f`` (parent on child) in the motion of the child relative to the parent is ``f' v_rel``; where that motion has one
+The power of a joint's wrench ``f`` (parent on child) in the motion of the child relative to the parent is ``f'
+v_rel``; where that motion has one
 coordinate, ``v_rel = s(q) dq`` and the coordinate's generalised force is
 
     ``tau = s' f = w . M + (dT/dq) . F``
 
-with w the axis in the child's frame, M the moment about the child's origin and dT/dq how its origin slides in the parent, both per unit of q.
+with w the axis in the child's frame, M the moment about the child's origin and dT/dq how its origin slides in the
+parent, both per unit of q.
 ``w . M`` alone is off by what the force does along the slide. OpenSim's inverse dynamics reports this sum.
 """
 
@@ -34,9 +36,11 @@ class Coordinate:
     ----------
     name, joint : str
     direction : ndarray
-        (n, 6) ``s = v_rel / dq`` ``[linear; angular]`` in the child's frame, at its origin: m (or 1 for a sliding coordinate) and rad per unit of q.
+        (n, 6) ``s = v_rel / dq`` ``[linear; angular]`` in the child's frame, at its origin: m (or 1 for a sliding
+        coordinate) and rad per unit of q.
     misfit : float
-        Largest part of the relative velocity (m/s, rad/s, root mean square) that the coordinate does not explain: large where the joint has more
+        Largest part of the relative velocity (m/s, rad/s, root mean square) that the coordinate does not explain:
+        large where the joint has more
         coordinates than this one.
     """
 
@@ -71,7 +75,8 @@ def coordinate_from_motion(
 ) -> Coordinate:
     """Direction of a joint's single coordinate, from the motion of its links.
 
-    The relative velocity of the two links is fitted by ``s(q) dq`` with polynomials s of the coordinate, all frames together, so that frames in which
+    The relative velocity of the two links is fitted by ``s(q) dq`` with polynomials s of the coordinate, all frames
+    together, so that frames in which
     the joint hardly moves do no harm.
 
     Parameters

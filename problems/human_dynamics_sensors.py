@@ -105,7 +105,7 @@ class Sensor:
             except np.linalg.LinAlgError:
                 raise InputError(
                     f"covariance of {self.name}", "a positive definite matrix", "a singular or indefinite one"
-                )
+                ) from None
         elif np.any(C <= 0.0):
             raise InputError(
                 f"covariance of {self.name}", f"variances above zero in ({self.unit})^2", f"{C.min():.6g}"

@@ -79,7 +79,10 @@ def load_coordinates(path: str | Path) -> dict[str, tuple[FloatArray, FloatArray
     """
     data = _read(path, ("names", "Q", "dQ"))
     names, Q, dQ = data["names"], data["Q"], data["dQ"]
-    return {str(name): (np.asarray(Q[:, i], dtype=float), np.asarray(dQ[:, i], dtype=float)) for i, name in enumerate(names)}
+    return {
+        str(name): (np.asarray(Q[:, i], dtype=float), np.asarray(dQ[:, i], dtype=float))
+        for i, name in enumerate(names)
+    }
 
 
 def load_links(

@@ -203,8 +203,7 @@ class ActiveSetSolver:
         G: FloatArray,
         h: FloatArray,
     ) -> None:
-        """Fill in the square-root informations that hold rows of some frames: 1e-8 of the variance that the
-        row has when it is free."""
+        """Fill in what holds rows of some frames: 1e-8 of the variance that a row has when it is free."""
         if not frames.size:
             return
         none = np.zeros((frames.size, h.shape[1]))

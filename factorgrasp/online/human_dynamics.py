@@ -221,9 +221,7 @@ class OnlineHumanDynamics:
             P = np.stack(result.marginals[: joints + links])[:, 0]
             variance = np.einsum("di,dij,dj->d", S, P[self._owner], S)
             cov = P[joints:]
-            for (j, group), block in zip(
-                self._turning.items(), result.marginals[joints + links :], strict=True
-            ):
+            for j, block in zip(self._turning, result.marginals[joints + links :], strict=True):
                 own = np.flatnonzero(self._owner == j)
                 reader = np.concatenate([S[own], turns[j]], axis=1)
                 variance[own] = np.einsum("di,ij,dj->d", reader, block[0], reader)
