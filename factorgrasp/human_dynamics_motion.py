@@ -226,15 +226,17 @@ def _from_joints(
             "[motion]", "a stretch without gaps that is longer than the filter of the derivatives", "none"
         )
     tree = PinocchioTree(model, gravity=gravity)
+    # Noise of a slower source has the same density in the filter's band, which white noise of the faster clock must have.
+    gain = moved.acceleration_gain * max(1.0, float(np.median(np.diff(t))) / dt)
     variances: dict[str, PerName] = {}
     if (angle := get(motion, "angle_sd", float, where, None)) is not None:
-        variances["joint_acceleration"] = _variance(angle, "angle_sd") * moved.acceleration_gain
+        variances["joint_acceleration"] = _variance(angle, "angle_sd") * gain
     position, turn = (get(motion, key, float, where, None) for key in ("position_sd", "orientation_sd"))
     if (position is None) != (turn is None):
         raise InputError("[motion] position_sd, orientation_sd", "both or none", "one of them")
     if position is not None:
         parts = _variance(position, "position_sd"), _variance(turn, "orientation_sd")
-        variances["link_acceleration"] = tuple(moved.acceleration_gain * v for v in parts for _ in range(3))
+        variances["link_acceleration"] = tuple(gain * v for v in parts for _ in range(3))
     return _known(
         clock, good, tree.motion(clock[good], moved.q[good], moved.qd[good], moved.qdd[good]), variances
     )

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PAGE = "human_dynamics.md"
+DPI = 130
 ARM = ("jRightShoulder", "jRightElbow", "jRightWrist")
 HAND_COVARIANCE = (1e4, 1e4, 1e4, 1.0, 1.0, 1.0)
 """Of unmeasured contacts: forces free, moments about where the hand holds small."""
@@ -415,11 +416,9 @@ def write_page(folder: Path, names: Sequence[str] = tuple(FIGURES)) -> list[Path
         content = shown.markdown()
         text = place.sub(_put(content), text)
         if shown.figure is not None:
-            path = folder / "figures" / f"human_dynamics_{name}.svg"
+            path = folder / "figures" / f"human_dynamics_{name}.png"
             with replacing(path) as temporary:
-                shown.figure.savefig(
-                    temporary, format="svg", facecolor=plots.PALETTE["paper"], metadata={"Date": None}
-                )
+                shown.figure.savefig(temporary, format="png", dpi=DPI, facecolor=plots.PALETTE["paper"])
             written.append(path)
     return [*written, write_text(page, text)]
 
