@@ -126,7 +126,7 @@ class HumanDynamicsTask:
 
         payload = None
         if self.contacts and self.method == "joint":
-            frames, x, P = solve_with_contacts(self.problem, solver)
+            frames, x, P = solve_with_contacts(self.problem, solver, self.payload)
             if self.payload:
                 payload = payload_of(
                     self.problem.motion, self.noise, self.contacts, self.payload, x, P, self._points

@@ -19,6 +19,7 @@ import numpy as np
 from factorgrasp.errors import InputError
 from factorgrasp.least_squares import LeastSquares, Term
 from factorgrasp.problems.external_wrenches_estimate import ExternalWrenchesEstimate
+from factorgrasp.problems.external_wrenches_state import state_spread
 from factorgrasp.problems.human_dynamics_names import wrench_on
 from factorgrasp.problems.human_dynamics_rows import sensor_rows
 from factorgrasp.problems.human_dynamics_sensors import ExternalWrench
@@ -29,6 +30,9 @@ from factorgrasp.problems.link_motion_spatial import skew
 from factorgrasp.typing import FloatArray
 from factorgrasp.uncertainty import Covariance
 from factorgrasp.variables import Variable
+
+MOTION_CAPTURE = (4.0, 4.0, 4.0, 1.0, 1.0, 1.0)
+MODEL_ERROR = 1e-3
 
 
 class ExternalWrenches:
@@ -43,10 +47,10 @@ class ExternalWrenches:
         Links that may carry a wrench nobody measures.
     noise : HumanDynamicsNoise
         Its `free_wrench` and `contact_wrench` are used.
-    momentum_rate : PerName
-        Variances of ``hdot_G - w``: N^2 and (Nm)^2, six components in world axes. The paper has 1e-3; what accelerations from
-        motion capture
-        leave is nearer to the default.
+    momentum_rate : PerName, optional
+        Variances of ``hdot_G - w``: N^2 and (Nm)^2, six components in world axes. The paper has 1e-3, which is the default where the motion
+        tells the noise of its configurations (:attr:`LinkMotion.state_noise`), as what that does to the momentum is counted then; without
+        it the default is (4, 4, 4, 1, 1, 1), nearer to what accelerations from motion capture leave.
     """
 
     kind = "external_wrenches"
@@ -57,7 +61,7 @@ class ExternalWrenches:
         sensors: Sequence[ExternalWrench],
         contacts: Sequence[str],
         noise: HumanDynamicsNoise | None = None,
-        momentum_rate: PerName = (4.0, 4.0, 4.0, 1.0, 1.0, 1.0),
+        momentum_rate: PerName | None = None,
     ) -> None:
         self.motion, self.sensors, self.contacts = motion, tuple(sensors), tuple(contacts)
         self.noise = noise or HumanDynamicsNoise()
@@ -85,6 +89,8 @@ class ExternalWrenches:
             raise InputError("sensors", "one a link", ", ".join(measured), "Combine two of one link before")
         self._free = resolve(self.noise.free_wrench, links, [6] * len(links), "free wrench variance")
         self._loose = resolve(self.noise.contact_wrench, links, [6] * len(links), "contact wrench variance")
+        if momentum_rate is None:
+            momentum_rate = MODEL_ERROR if motion.state_noise is not None else MOTION_CAPTURE
         self._momentum = resolve(momentum_rate, ["the body"], [6], "momentum rate variance")[0]
 
     def __len__(self) -> int:
@@ -126,28 +132,49 @@ class ExternalWrenches:
         """All frames by the closed form of rank six."""
         mean, C = self.prior()
         A = self.centroidal_maps()
+        found = self._posterior(mean, C, A, mean)
+        # The noise of the state acts through the wrenches, those of the contacts included.
+        return found if self.motion.state_noise is None else self._posterior(mean, C, A, found.wrench)
+
+    def _posterior(
+        self, mean: FloatArray, C: FloatArray, A: FloatArray, wrenches: FloatArray
+    ) -> ExternalWrenchesEstimate:
+        motion, links = self.motion, self.motion.links
         AC = A @ C
         S = np.einsum("nlij,nlkj->nik", AC, A) + np.diag(self._momentum)
-        innovation = self.motion.momentum_rate - np.einsum("nlij,nlj->ni", A, mean)
+        spread = None
+        if motion.state_noise is not None:
+            measured = [links.index(sensor.link) for sensor in self.sensors]
+            world = [sensor.frame == "world" for sensor in self.sensors]
+            contacts = [links.index(link) for link in self.contacts]
+            spread = state_spread(motion, motion.state_noise, A, wrenches, measured, world, contacts)
+            F = spread.innovation
+            S = S + F @ np.swapaxes(F, 1, 2)
+            for i, link in enumerate(measured):
+                E = spread.wrench[:, i]
+                AC[:, link] += F[:, :, : E.shape[2]] @ np.swapaxes(E, 1, 2)
+        innovation = motion.momentum_rate - np.einsum("nlij,nlj->ni", A, mean)
+        weighted = np.linalg.solve(S, innovation[..., None])
         gain = np.linalg.solve(S[:, None], AC)
-        posterior_mean = (
-            mean + (np.swapaxes(AC, -1, -2) @ np.linalg.solve(S, innovation[..., None])[:, None])[..., 0]
-        )
-        nis = np.einsum("ni,ni->n", innovation, np.linalg.solve(S, innovation[..., None])[..., 0])
+        covariance = C - np.swapaxes(AC, -1, -2) @ gain
+        if spread is not None:
+            for i, link in enumerate(measured):
+                covariance[:, link] += spread.wrench[:, i] @ np.swapaxes(spread.wrench[:, i], 1, 2)
         return ExternalWrenchesEstimate(
-            t=self.motion.t,
-            motion=self.motion,
-            links=self.motion.links,
+            t=motion.t,
+            motion=motion,
+            links=links,
             measured=tuple(sensor.link for sensor in self.sensors),
             contacts=self.contacts,
-            wrench=posterior_mean,
-            covariance=C - np.swapaxes(AC, -1, -2) @ gain,
+            wrench=mean + (np.swapaxes(AC, -1, -2) @ weighted[:, None])[..., 0],
+            covariance=covariance,
             prior_covariance=C,
             seen=AC,
             gain=gain,
             momentum_innovation=innovation,
             momentum_covariance=S,
-            nis=nis,
+            nis=(innovation[:, None] @ weighted)[:, 0, 0],
+            spread=spread,
         )
 
     def frame(self, index: int) -> LeastSquares:

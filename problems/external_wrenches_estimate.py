@@ -9,6 +9,7 @@ import numpy as np
 
 from factorgrasp.errors import InputError
 from factorgrasp.observability import Direction, Observability
+from factorgrasp.problems.external_wrenches_state import StateSpread
 from factorgrasp.problems.human_dynamics_sensors import WrenchSet
 from factorgrasp.problems.link_motion import LinkMotion
 from factorgrasp.problems.link_motion_spatial import rotate
@@ -67,6 +68,8 @@ class ExternalWrenchesEstimate:
         (n, 6) what the momentum's rate says beyond the prior, and (n, 6, 6) its covariance.
     nis : ndarray
         (n,) normalised innovation squared of the six momentum rows.
+    spread : StateSpread or None
+        What the noise of the configurations does, where the motion tells it; it is counted in all covariances but the prior ones.
     """
 
     t: FloatArray
@@ -82,6 +85,7 @@ class ExternalWrenchesEstimate:
     momentum_innovation: FloatArray = field(repr=False)
     momentum_covariance: FloatArray = field(repr=False)
     nis: FloatArray = field(repr=False)
+    spread: StateSpread | None = field(default=None, repr=False)
 
     def __len__(self) -> int:
         return int(self.t.size)
@@ -115,8 +119,17 @@ class ExternalWrenchesEstimate:
                 )
                 if i == j:
                     block = block + self.prior_covariance[:, i]
+                one, other = self._moved(links[a]), self._moved(links[b])
+                if one is not None and other is not None:
+                    block = block + one @ np.swapaxes(other, 1, 2)
                 out[:, 6 * a : 6 * a + 6, 6 * b : 6 * b + 6] = block
         return 0.5 * (out + np.swapaxes(out, 1, 2))
+
+    def _moved(self, link: str) -> FloatArray | None:
+        """(n, 6, k) what errors of the configuration do to a measured wrench."""
+        if self.spread is None or link not in self.measured:
+            return None
+        return self.spread.wrench[:, self.measured.index(link)]
 
     def as_sensor(self, links: Sequence[str] | None = None) -> WrenchSet:
         """These wrenches with their full covariance, as a measurement for ``HumanDynamics``.
@@ -132,6 +145,10 @@ class ExternalWrenchesEstimate:
         """Mass that hangs on some links (all contacts): ``m = sum_h f_h' u_h / |u_h|^2`` with ``u_h = g - a_h``.
 
         The links' own acceleration is part of it: dividing by standard gravity alone is biased while they move.
+        Where the motion tells the noise
+        of its configurations, that of these accelerations is counted, together with what it does to the forces, and
+        the bias that it makes is
+        taken out.
 
         Raises
         ------
@@ -146,13 +163,30 @@ class ExternalWrenchesEstimate:
                 )
         reader = np.zeros((len(self), 6 * len(chosen)))
         values = np.concatenate([self.of(link) for link in chosen], axis=1)
+        carried = None if self.spread is None else np.zeros((len(self), self.spread.innovation.shape[2]))
+        bias = np.zeros(len(self))
         for a, link in enumerate(chosen):
-            i = self._index(link)
+            i, part = self._index(link), slice(6 * a, 6 * a + 3)
             u = self.motion.gravity - self.motion.acceleration[:, i]
             along = np.einsum("nij,ni->nj", self.motion.R[:, i], u)
-            reader[:, 6 * a : 6 * a + 3] = along / np.sum(u**2, axis=1, keepdims=True)
-        mass = np.einsum("ni,ni->n", reader, values)
+            square = np.sum(u**2, axis=1, keepdims=True)
+            reader[:, part] = along / square
+            if self.spread is not None and carried is not None:
+                felt = self.spread.acceleration[:, self.contacts.index(link), :3]
+                share = np.sum(values[:, part] * along, axis=1, keepdims=True) / square
+                carried += -np.einsum("ni,nik->nk", (values[:, part] - 2.0 * share * along) / square, felt)
+                pull = self.gain[:, i, :, :3]
+                force = -np.swapaxes(pull, 1, 2) @ self.spread.innovation
+                bias += ratio_bias(
+                    values[:, part], along, -felt @ np.swapaxes(force, 1, 2), felt @ np.swapaxes(felt, 1, 2)
+                )
+        mass = np.einsum("ni,ni->n", reader, values) - bias
         variance = np.einsum("ni,nij,nj->n", reader, self.joint_covariance(chosen), reader)
+        if self.spread is not None and carried is not None:
+            # What the state's noise does to the forces goes with what it does to the accelerations.
+            gain = np.concatenate([self.gain[:, self._index(link)] for link in chosen], axis=2)
+            force = -np.einsum("nij,nj,nik->nk", gain, reader, self.spread.innovation)
+            variance = variance + np.sum((carried + 2.0 * force) * carried, axis=1)
         weight = 1.0 / variance
         mean = float(np.sum(weight * mass) / np.sum(weight))
         return Payload(
@@ -283,6 +317,18 @@ def _judged(vector: FloatArray, before: float, after: float, words: str, unit: s
         words,
         unit,
     )
+
+
+def ratio_bias(f: FloatArray, u: FloatArray, C_uf: FloatArray, C_uu: FloatArray) -> FloatArray:
+    """Second-order bias (n,) of ``f' u / u' u`` by the noise of u and what of f goes with it."""
+    square, dot = np.sum(u**2, axis=1), np.sum(f * u, axis=1)
+
+    def form(a: FloatArray, C: FloatArray, b: FloatArray) -> FloatArray:
+        return np.asarray(np.einsum("ni,nij,nj->n", a, C, b))
+
+    trace = np.trace(C_uf, axis1=1, axis2=2) / square - 2.0 * form(u, C_uf, u) / square**2
+    bend = -2.0 * form(f, C_uu, u) / square**2 - dot * np.trace(C_uu, axis1=1, axis2=2) / square**2
+    return np.asarray(trace + bend + 4.0 * dot * form(u, C_uu, u) / square**3)
 
 
 def _inflation(residual: FloatArray) -> float:

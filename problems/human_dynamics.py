@@ -8,6 +8,8 @@ linear read-outs with theirs.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,11 +19,13 @@ from factorgrasp.estimate import Estimate
 from factorgrasp.least_squares import LeastSquares
 from factorgrasp.problems.human_dynamics_constraints import DynamicsConstraint
 from factorgrasp.problems.human_dynamics_estimate import HumanDynamicsEstimate, read_frames
+from factorgrasp.problems.human_dynamics_point import measured_wrenches, newton_euler
 from factorgrasp.problems.human_dynamics_sensors import Sensor
 from factorgrasp.problems.human_dynamics_settings import HumanDynamicsNoise
+from factorgrasp.problems.human_dynamics_state import state_sensors
 from factorgrasp.problems.human_dynamics_system import HumanDynamicsSystem
 from factorgrasp.problems.human_dynamics_whitening import Whitening
-from factorgrasp.problems.link_motion import LinkMotion
+from factorgrasp.problems.link_motion import LinkKinematics, LinkMotion
 from factorgrasp.typing import BoolArray, FloatArray, IntArray
 
 
@@ -62,6 +66,7 @@ class HumanDynamics:
         hard_dynamics: bool = False,
         use_motion: bool = True,
     ) -> None:
+        arguments = (noise, tuple(contacts), hard_dynamics, use_motion)
         self.motion, self.sensors, self.constraints = motion, tuple(sensors), tuple(constraints)
         count = len(motion)
         for sensor in self.sensors:
@@ -71,17 +76,47 @@ class HumanDynamics:
                     f"values at the {count} frames of the motion",
                     f"{sensor.values.shape[0]} rows",
                 )
-        rows = [constraint.row_pattern(motion.tree) for constraint in self.constraints]
+        tree = motion.tree
+        rows = [constraint.row_pattern(tree) for constraint in self.constraints]
+        every, errors = self.sensors, motion.state_noise
+        if errors is not None:
+            every += state_sensors(tree, errors, motion.kinematics(), self.sensors, use_motion)
+            use_motion = use_motion and errors.acceleration_gain == 0.0
         self.system = HumanDynamicsSystem(
-            motion.tree, self.sensors, noise, contacts, use_motion, hard_dynamics, rows
+            tree, every, noise, contacts, use_motion, hard_dynamics, rows, errors is not None
         )
         self._values = (
-            np.concatenate([sensor.values for sensor in self.sensors], axis=1)
-            if self.sensors
-            else np.zeros((count, 0))
+            np.concatenate([sensor.values for sensor in every], axis=1) if every else np.zeros((count, 0))
         )
-        self._whitening = Whitening(self.system, self.sensors)
-        self._arguments = (noise, tuple(contacts), hard_dynamics, use_motion)
+        self._whitening = Whitening(self.system, every)
+        self._arguments = arguments
+        self._kinematics = motion.kinematics()
+        self._measured_all = True
+        if errors is not None:
+            values = [sensor.values for sensor in self.sensors]
+            external, complete = measured_wrenches(tree, self._kinematics, self.sensors, values)
+            self._measured_all = complete and not self.system.contacts
+            self._linearise(external, newton_euler(tree, self._kinematics, external)[0])
+
+    def _linearise(self, external: FloatArray, joint: FloatArray) -> None:
+        self._kinematics = replace(self._kinematics, external_wrench=external, joint_wrench=joint)
+
+    def relinearised(self, x: FloatArray) -> HumanDynamics | None:
+        """The same problem with errors of poses linearised at the wrenches in the unknowns `x` (n, size); None when that is not needed.
+
+        It is where some wrenches are not measured: the first estimate then stands on those that Newton and Euler's recursion leaves out.
+        """
+        if self._measured_all:
+            return None
+        out, columns, k, count = copy(self), self.system.columns, self._kinematics, x.shape[0]
+        assert k.external_wrench is not None
+        assert k.joint_wrench is not None
+        good = np.asarray(np.isfinite(x).all(axis=1)).reshape(-1, 1, 1)
+        external = x[:, columns.external_wrench.ravel()].reshape(count, -1, 6)
+        joint = x[:, columns.joint_wrench.ravel()].reshape(count, -1, 6)
+        out._linearise(np.where(good, external, k.external_wrench), np.where(good, joint, k.joint_wrench))
+        out._measured_all = True
+        return out
 
     # ---- many frames: the protocol FrameProblem ---------------------------------------------------------------
 
@@ -111,13 +146,13 @@ class HumanDynamics:
     def whitened_frames(self, frames: slice) -> tuple[FloatArray, FloatArray]:
         """Whitened non-zeros (n, nnz) and right-hand sides (n, rows) of some frames."""
         values = self._values[frames]
-        entries, rhs = self.system.raw(self.motion.kinematics(frames), values)
+        entries, rhs = self.system.raw(self._kinematics.select(frames), values)
         self._whitening.apply(entries, rhs, values, frames)
         return entries, rhs
 
     def inequality_frames(self, frames: slice) -> tuple[FloatArray, FloatArray]:
         """Non-zeros (n, nnz) of the inequalities' rows and their limits (n, rows) of some frames."""
-        k, rows = self.motion.kinematics(frames), self.pattern.inequalities
+        k, rows = self._kinematics.select(frames), self.pattern.inequalities
         entries, limits = np.empty((k.count, rows.matrix.nnz)), np.empty((k.count, rows.height))
         for constraint in self.constraints:
             blocks, limit = constraint.all_rows(self.system.tree, k)
@@ -132,7 +167,7 @@ class HumanDynamics:
         if not 0 <= index < len(self):
             raise InputError("frame", f"0 to {len(self) - 1}", str(index))
         frames, system, problem = slice(index, index + 1), self.system, self.system.pattern
-        k = self.motion.kinematics(frames)
+        k = self._kinematics.select(frames)
         values = self._values[frames]
         entries, rhs = system.raw(k, values)
         problem.jacobian.matrix.data[:], problem.jacobian.rhs[:] = entries[0], rhs[0]
@@ -148,6 +183,11 @@ class HumanDynamics:
             problem.set_constraint(constraint.name, blocks, limit)
         return problem
 
+    @property
+    def kinematics(self) -> LinkKinematics:
+        """Of all frames, with the wrenches at which errors of poses are linearised."""
+        return self._kinematics
+
     def view_frames(self, result: Any) -> HumanDynamicsEstimate:
         """The typed view of all frames (a :class:`factorgrasp.solvers.frames.FrameResult`)."""
         return read_frames(self, result)
@@ -160,7 +200,12 @@ class HumanDynamics:
         noise, contacts, hard, use = self._arguments
         sensors = tuple(sensor.frames(index) for sensor in self.sensors)
         constraints = tuple(constraint.frames(index) for constraint in self.constraints)
-        return HumanDynamics(self.motion.select(index), sensors, noise, contacts, constraints, hard, use)
+        out = HumanDynamics(self.motion.select(index), sensors, noise, contacts, constraints, hard, use)
+        k = self._kinematics
+        if k.external_wrench is not None and k.joint_wrench is not None:
+            out._linearise(k.external_wrench[index], k.joint_wrench[index])
+            out._measured_all = self._measured_all
+        return out
 
     def least_squares(self) -> LeastSquares:
         """The problem of a single frame, for :func:`factorgrasp.solve` with any solver."""

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from factorgrasp.problems.human_dynamics_innovations import Innovation, innovations
+from factorgrasp.problems.human_dynamics_state import torque_turn
 from factorgrasp.problems.link_motion_spatial import rotate_back, skew
 from factorgrasp.status import Status
-from factorgrasp.typing import FloatArray
+from factorgrasp.typing import FloatArray, IntArray
 
 if TYPE_CHECKING:
     from factorgrasp.problems.human_dynamics import HumanDynamics
@@ -114,6 +115,12 @@ class HumanDynamicsEstimate:
         return summarize(self)
 
 
+def _by_group(groups: Sequence[IntArray], blocks: Sequence[FloatArray]) -> dict[tuple[int, ...], FloatArray]:
+    return (
+        {tuple(map(int, group)): block for group, block in zip(groups, blocks, strict=True)} if blocks else {}
+    )
+
+
 def read_frames(problem: HumanDynamics, result: Any) -> HumanDynamicsEstimate:
     """Typed view of a :class:`factorgrasp.solvers.frames.FrameResult`."""
     from factorgrasp.problems.human_dynamics_active import active_constraints
@@ -121,8 +128,9 @@ def read_frames(problem: HumanDynamics, result: Any) -> HumanDynamicsEstimate:
     system, motion = problem.system, problem.motion
     tree, columns, x = system.tree, system.columns, result.x
     count, links, joints = x.shape[0], len(tree.links), len(tree.joints)
-    k = motion.kinematics()
+    k = problem.kinematics
     have = bool(result.marginals)
+    known = _by_group(system.marginals, result.marginals)
     nothing = np.full((count, 6, 6), np.nan)
     P_joint = (
         np.stack(result.marginals[:joints], axis=1)
@@ -146,7 +154,17 @@ def read_frames(problem: HumanDynamics, result: Any) -> HumanDynamicsEstimate:
         assert S is not None
         back = np.swapaxes(S, 1, 2)
         torque.append((back @ wrench[:, j, :, None])[..., 0])
-        torque_cov.append(np.asarray(back @ P_joint[:, j] @ S))
+        group = system.turning.get(j)
+        if group is None:
+            torque_cov.append(np.asarray(back @ P_joint[:, j] @ S))
+            continue
+        # Errors of the joint's position turn its axes.
+        T = torque_turn(S, wrench[:, j])
+        torque[-1] = torque[-1] + (T @ x[:, group[6:], None])[..., 0]
+        reader = np.concatenate([back, T], axis=2)
+        P = known.get(tuple(map(int, group)))
+        blank = np.full((count, S.shape[2], S.shape[2]), np.nan)
+        torque_cov.append(blank if P is None else np.asarray(reader @ P @ np.swapaxes(reader, 1, 2)))
     dofs = [columns.joint_acceleration[j] for j in system.axes]
     at = np.concatenate([*dofs, np.empty(0, dtype=np.intp)]).astype(np.intp)
     torque_var = [np.diagonal(C, axis1=1, axis2=2) for C in torque_cov]

@@ -69,7 +69,8 @@ def innovations(problem: HumanDynamics, k: LinkKinematics, result: Any) -> tuple
         for group, block in zip(system.marginals, result.marginals, strict=True)
     }
     out = []
-    for i, (rows, sensor) in enumerate(zip(system.sensors, problem.sensors, strict=True)):
+    # Rows of the motion's own noise stand behind the sensors.
+    for i, (rows, sensor) in enumerate(zip(system.sensors, problem.sensors, strict=False)):
         group = system.touched(rows)
         P = known[tuple(int(v) for v in group)]
         out.append(_innovation(rows, k, sensor.values, sensor.variances(), result.x[:, group], P, i))

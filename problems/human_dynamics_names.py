@@ -21,3 +21,8 @@ def wrench_of(joint: str) -> str:
 def joint_acceleration_of(joint: str) -> str:
     """A joint's accelerations."""
     return f"joint acceleration of {joint}"
+
+
+def pose_error_of(name: str) -> str:
+    """Error of a joint's position, or of the root's pose, true less measured."""
+    return f"pose error of {name}"

@@ -16,6 +16,13 @@ from factorgrasp.problems.human_dynamics_names import (
     wrench_on,
 )
 from factorgrasp.problems.human_dynamics_sensors import Sensor
+from factorgrasp.problems.human_dynamics_state import (
+    MotionAcceleration,
+    StateError,
+    motion_acceleration,
+    on_world_wrench,
+    state_error,
+)
 from factorgrasp.problems.link_motion import BodyTree, LinkKinematics
 from factorgrasp.problems.link_motion_spatial import cross, rotate, skew
 from factorgrasp.typing import BoolArray, FloatArray
@@ -63,8 +70,8 @@ class SensorRows:
         return np.concatenate([np.broadcast_to(part, (count, *part.shape[1:])) for part in parts], axis=2)
 
 
-def sensor_rows(tree: BodyTree, sensor: Sensor) -> SensorRows:
-    """Rows of a sensor on a body.
+def sensor_rows(tree: BodyTree, sensor: Sensor, state_errors: bool = False) -> SensorRows:
+    """Rows of a sensor on a body; with `state_errors` also how errors of the configuration enter them.
 
     Raises
     ------
@@ -85,6 +92,9 @@ def sensor_rows(tree: BodyTree, sensor: Sensor) -> SensorRows:
     if make is None:
         raise InputError("sensor", "one of " + ", ".join(t.__name__ for t in _MAKERS), type(sensor).__name__)
     blocks, varying, offset = make(tree, sensor)
+    if state_errors and isinstance(sensor, kinds.ExternalWrench) and sensor.frame == "world":
+        for name, (size, error) in on_world_wrench(tree, tree.links.index(sensor.link)).items():
+            blocks[name], varying[name] = np.ones((6, size)), error
     patterns = {name: block != 0.0 for name, block in blocks.items()}
     constant = {name: block for name, block in blocks.items() if name not in varying}
     placement = None
@@ -227,6 +237,8 @@ _MAKERS: dict[type[Sensor], Callable[[BodyTree, Sensor], Made]] = {
     kinds.JointAcceleration: _joint_acceleration,
     kinds.WrenchSet: _wrench_set,
     kinds.MomentumRate: _momentum_rate,
+    StateError: state_error,
+    MotionAcceleration: motion_acceleration,
 }
 
 

@@ -17,12 +17,19 @@ from factorgrasp.least_squares import Constraint, LeastSquares, Term
 from factorgrasp.problems.human_dynamics_names import (
     acceleration_of,
     joint_acceleration_of,
+    pose_error_of,
     wrench_of,
     wrench_on,
 )
 from factorgrasp.problems.human_dynamics_rows import SensorRows, sensor_rows
 from factorgrasp.problems.human_dynamics_sensors import Sensor
 from factorgrasp.problems.human_dynamics_settings import HumanDynamicsNoise
+from factorgrasp.problems.human_dynamics_state import (
+    MotionAcceleration,
+    StateError,
+    on_balance,
+    on_propagation,
+)
 from factorgrasp.problems.human_dynamics_terms import MOTION, DynamicsTerms
 from factorgrasp.problems.link_motion import BodyTree, LinkKinematics
 from factorgrasp.problems.link_motion_spatial import centripetal, velocity_wrench
@@ -72,6 +79,8 @@ class HumanDynamicsSystem:
         Propagation and balance as equality constraints.
     inequalities : sequence of Constraint
         Rows that :meth:`fill` leaves alone.
+    state_errors : bool
+        Errors of the configuration are unknowns, too (:mod:`factorgrasp.problems.human_dynamics_state`).
     """
 
     def __init__(
@@ -83,6 +92,7 @@ class HumanDynamicsSystem:
         use_motion: bool = True,
         hard_dynamics: bool = False,
         inequalities: Sequence[Constraint] = (),
+        state_errors: bool = False,
     ) -> None:
         self.tree, self.noise, self.hard_dynamics = tree, noise or HumanDynamicsNoise(), hard_dynamics
         self.contacts = tuple(contacts)
@@ -90,9 +100,11 @@ class HumanDynamicsSystem:
             if link not in tree.links:
                 raise InputError("contacts", "links among " + ", ".join(tree.links), repr(link))
         self.axes = tuple(j for j, dofs in enumerate(tree.dofs) if dofs)
-        self._terms = DynamicsTerms(tree, self.noise, self.contacts)
+        self.state_errors = state_errors
+        self._terms = DynamicsTerms(tree, self.noise, self.contacts, state_errors)
         variables = self._terms.variables()
-        self._sensor_rows: list[SensorRows] = [sensor_rows(tree, sensor) for sensor in sensors]
+        self._judged = [not isinstance(sensor, StateError | MotionAcceleration) for sensor in sensors]
+        self._sensor_rows: list[SensorRows] = [sensor_rows(tree, sensor, state_errors) for sensor in sensors]
         names = [rows.name for rows in self._sensor_rows]
         if len(set(names)) != len(names):
             twice = sorted({name for name in names if names.count(name) > 1})
@@ -139,15 +151,30 @@ class HumanDynamicsSystem:
             *(self.columns.joint_acceleration[j] for j in self.axes),
         ]
         known = {tuple(group) for group in out}
-        for rows in self._sensor_rows:
+        for rows, judged in zip(self._sensor_rows, self._judged, strict=True):
+            if not judged:
+                continue
             group = self.touched(rows)
             if tuple(group) not in known:
                 known.add(tuple(group))
                 out.append(group)
-        for group in self.columns.acceleration:
+        for group in [*self.columns.acceleration, *self.turning.values()]:
             if tuple(group) not in known and group[0] >= 0:
+                known.add(tuple(group))
                 out.append(group)
         return tuple(out)
+
+    @property
+    def turning(self) -> dict[int, IntArray]:
+        """By joint whose axes move: its wrench and the errors of its position, which the torques read together."""
+        if not self.state_errors:
+            return {}
+        where = self.pattern.columns
+        return {
+            j: np.r_[self.columns.joint_wrench[j], where[pose_error_of(self.tree.joints[j])]]
+            for j in self.axes
+            if self.tree.subspaces[j] is None
+        }
 
     def touched(self, rows: SensorRows) -> IntArray:
         """Unknowns that a sensor's rows touch."""
@@ -203,6 +230,10 @@ class HumanDynamicsSystem:
                 put(rows, joint_acceleration_of(joint), -S)
             else:
                 moving.append((j, dynamics.places(rows, joint_acceleration_of(joint))))
+            if self.state_errors:
+                error, above = pose_error_of(joint), f"balance of {tree.links[tree.parents[j]]}"
+                writers.append((dynamics.places(rows, error), _flat(on_propagation(tree, j))))
+                writers.append((dynamics.places(above, error), _flat(on_balance(tree, j))))
         for i, link in enumerate(tree.links):
             rows = f"balance of {link}"
             put(rows, wrench_on(link), -np.eye(6))
@@ -344,6 +375,10 @@ def _rows(slices: Mapping[str, slice], names: Sequence[str]) -> slice:
     if not names:
         return slice(0, 0)
     return slice(slices[names[0]].start, slices[names[-1]].stop)
+
+
+def _flat(make: Writer) -> Writer:
+    return lambda k: make(k).reshape(k.count, -1)
 
 
 def _minus_axes(tree: BodyTree, joints: Sequence[int]) -> Writer:

@@ -11,11 +11,13 @@ from factorgrasp.least_squares import Term
 from factorgrasp.problems.human_dynamics_names import (
     acceleration_of,
     joint_acceleration_of,
+    pose_error_of,
     wrench_of,
     wrench_on,
 )
 from factorgrasp.problems.human_dynamics_sensors import Sensor
 from factorgrasp.problems.human_dynamics_settings import HumanDynamicsNoise, resolve
+from factorgrasp.problems.human_dynamics_state import holders
 from factorgrasp.problems.link_motion import BodyTree
 from factorgrasp.typing import FloatArray
 from factorgrasp.uncertainty import Covariance
@@ -40,8 +42,10 @@ class DynamicsTerms:
         Joints and links whose accelerations are taken from the motion; filled by :meth:`kinematic`.
     """
 
-    def __init__(self, tree: BodyTree, noise: HumanDynamicsNoise, contacts: tuple[str, ...]) -> None:
-        self.tree, self.noise, self.contacts = tree, noise, contacts
+    def __init__(
+        self, tree: BodyTree, noise: HumanDynamicsNoise, contacts: tuple[str, ...], state_errors: bool = False
+    ) -> None:
+        self.tree, self.noise, self.contacts, self.state_errors = tree, noise, contacts, state_errors
         self.axes = tuple(j for j, dofs in enumerate(tree.dofs) if dofs)
         self.motion_joints: list[int] = []
         self.motion_links: list[int] = []
@@ -65,6 +69,8 @@ class DynamicsTerms:
             )
             for j in self.axes
         ]
+        if self.state_errors:
+            out += [Variable(name, at.size, unit="rad, m") for name, at in holders(tree)]
         return out
 
     def dynamics(self) -> list[Term]:
@@ -83,6 +89,8 @@ class DynamicsTerms:
             pattern[joint_acceleration_of(tree.joints[j])] = (
                 np.ones((6, len(tree.dofs[j])), dtype=bool) if S is None else S != 0.0
             )
+            if self.state_errors:
+                pattern[pose_error_of(tree.joints[j])] = np.ones((6, len(tree.dofs[j])), dtype=bool)
             name = f"propagation through {tree.joints[j]}"
             terms.append(
                 Term(
@@ -103,6 +111,8 @@ class DynamicsTerms:
                     pattern[wrench_of(joint)] = eye
                 elif tree.parents[j] == i:
                     pattern[wrench_of(joint)] = MOTION.T
+                    if self.state_errors:
+                        pattern[pose_error_of(joint)] = np.ones((6, len(tree.dofs[j])), dtype=bool)
             terms.append(
                 Term(
                     f"balance of {link}",
@@ -229,6 +239,8 @@ class DynamicsTerms:
             by_name[joint_acceleration_of(name)] = variance
         out = []
         for v in variables:
+            if v.name not in by_name:
+                continue
             covariance = Covariance.diagonal(by_name[v.name])
             pattern = {v.name: np.eye(v.size, dtype=bool)}
             out.append(

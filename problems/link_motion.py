@@ -7,6 +7,7 @@ accelerations of links, joint centres, and axes where they are known.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
@@ -15,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from factorgrasp.errors import InputError
+from factorgrasp.models.state_noise import StateNoise
 from factorgrasp.problems.link_motion_check import check_masses, check_names, check_rotations, check_tree
 from factorgrasp.problems.link_motion_parts import BodyTree, LinkJoint, LinkKinematics
 from factorgrasp.problems.link_motion_spatial import (
@@ -27,7 +29,15 @@ from factorgrasp.problems.link_motion_spatial import (
 )
 from factorgrasp.typing import BoolArray, FloatArray, IntArray
 
-__all__ = ["GRAVITY", "BodyTree", "LinkJoint", "LinkKinematics", "LinkMotion", "spherical_subspace"]
+__all__ = [
+    "GRAVITY",
+    "BodyTree",
+    "LinkJoint",
+    "LinkKinematics",
+    "LinkMotion",
+    "StateNoise",
+    "spherical_subspace",
+]
 
 GRAVITY = (0.0, 0.0, -9.80665)
 
@@ -65,6 +75,9 @@ class LinkMotion:
         Whether the root link moves freely or has a given acceleration.
     gravity : ndarray
         (3,) in the world, m/s^2.
+    state_noise : StateNoise or None
+        Covariance of the configurations that the motion was computed from; the axes of all joints must be known then. None: the poses are
+        taken to be exact. :meth:`with_state_noise` adds it.
     """
 
     t: FloatArray
@@ -83,6 +96,7 @@ class LinkMotion:
     joint_acceleration: FloatArray | None = None
     base: Literal["floating", "fixed"] = "floating"
     gravity: FloatArray = field(default_factory=lambda: np.array(GRAVITY))
+    state_noise: StateNoise | None = None
 
     def __post_init__(self) -> None:
         count, links, joints = np.size(self.t), len(self.links), len(self.joints)
@@ -116,6 +130,25 @@ class LinkMotion:
                 raise InputError(
                     f"subspace of joint {joint.name}", f"{count} frames", str(joint.subspace.shape[0])
                 )
+        if self.state_noise is not None:
+            self._check_state_noise(self.state_noise)
+
+    def _check_state_noise(self, noise: StateNoise) -> None:
+        blind = [joint.name for joint in self.joints if not joint.dofs]
+        if blind:
+            raise InputError(
+                "state noise of the motion", "joints with known axes", ", ".join(blind[:5]) + ", of which only the centre is known",
+                "Declare them as ball joints",
+            )  # fmt: skip
+        noise.check(6 * (self.base == "floating") + len(self.dof_names), len(self))
+
+    def with_state_noise(self, noise: StateNoise | None) -> LinkMotion:
+        """The same motion with the noise of its configurations; all that is computed already stays so."""
+        if noise is not None:
+            self._check_state_noise(noise)
+        out = copy(self)
+        object.__setattr__(out, "state_noise", noise)
+        return out
 
     # ---- structure --------------------------------------------------------------------------------------------
 
@@ -181,7 +214,8 @@ class LinkMotion:
         )
         parts = {name: getattr(self, name)[index] for name in names}
         qdd = None if self.joint_acceleration is None else self.joint_acceleration[index]
-        return replace(self, joints=joints, joint_acceleration=qdd, **parts)
+        noise = None if self.state_noise is None else self.state_noise.select(index)
+        return replace(self, joints=joints, joint_acceleration=qdd, state_noise=noise, **parts)
 
     @property
     def tree(self) -> BodyTree:

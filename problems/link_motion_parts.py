@@ -80,6 +80,8 @@ class LinkKinematics:
         (n, dofs).
     joint_centre : ndarray
         (n, J, 3) in the world.
+    external_wrench, joint_wrench : ndarray or None
+        (n, L, 6) and (n, J, 6): wrenches at which errors of poses are linearised, where the motion's poses have errors.
     """
 
     R: FloatArray
@@ -92,6 +94,8 @@ class LinkKinematics:
     sizes: tuple[int, ...]
     joint_acceleration: FloatArray
     joint_centre: FloatArray
+    external_wrench: FloatArray | None = None
+    joint_wrench: FloatArray | None = None
 
     @property
     def count(self) -> int:
@@ -112,6 +116,8 @@ class LinkKinematics:
         return LinkKinematics(
             self.R[frames], self.p[frames], self.velocity[frames], self.acceleration[frames], self.transform[frames], self.bias[frames],
             self.axes[frames], self.sizes, self.joint_acceleration[frames], self.joint_centre[frames],
+            None if self.external_wrench is None else self.external_wrench[frames],
+            None if self.joint_wrench is None else self.joint_wrench[frames],
         )  # fmt: skip
 
 
@@ -146,3 +152,29 @@ class BodyTree:
     subspaces: tuple[FloatArray | None, ...]
     root: int
     fixed_base: bool
+
+    @cached_property
+    def from_leaves(self) -> tuple[int, ...]:
+        """Joints in an order in which every joint comes before the one above it."""
+        order: list[int] = []
+        left = set(range(len(self.joints)))
+        while left:
+            ready = [
+                j for j in sorted(left) if not any(self.parents[other] == self.children[j] for other in left)
+            ]
+            order += ready
+            left -= set(ready)
+        return tuple(order)
+
+    @cached_property
+    def paths(self) -> tuple[tuple[int, ...], ...]:
+        """By link, the joints between it and the root, nearest first."""
+        above = {int(child): j for j, child in enumerate(self.children)}
+        out = []
+        for link in range(len(self.links)):
+            path, at = [], link
+            while at in above:
+                path.append(above[at])
+                at = int(self.parents[above[at]])
+            out.append(tuple(path))
+        return tuple(out)

@@ -149,6 +149,11 @@ class PinocchioTree:
         """Of every joint: the components of pinocchio's velocities that belong to it."""
         return tuple(self._columns)
 
+    @property
+    def tangent_columns(self) -> IntArray:
+        """(k,) where the components of a :class:`~factorgrasp.problems.link_motion.StateNoise` stand in pinocchio's tangent vector."""
+        return np.concatenate([np.arange(6 if self.floating else 0), self._all_columns]).astype(np.intp)
+
     def motion(self, t: ArrayLike, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike) -> LinkMotion:
         """Link motion of n frames.
 
@@ -355,7 +360,7 @@ class _JointKind:
         elif name in ("RevoluteUnaligned", "RevoluteUnboundedUnaligned", "PrismaticUnaligned"):
             # Through the data: the bindings offer the axis of the generic joint under no name.
             data = joint.createData()
-            joint.calc(data, _neutral(model), np.zeros(model.nv))
+            joint.calc(data, neutral(model), np.zeros(model.nv))
             column = np.asarray(data.S).ravel()
             prismatic = name == "PrismaticUnaligned"
             self.axis = column[:3] if prismatic else column[3:]
@@ -437,7 +442,8 @@ def _check_quaternions(q: FloatArray) -> FloatArray:
     return np.asarray(norm)
 
 
-def _neutral(model: Any) -> FloatArray:
+def neutral(model: Any) -> FloatArray:
+    """The configuration (nq,) with all joints at zero."""
     import pinocchio as pin
 
     return np.asarray(pin.neutral(model))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -318,6 +318,19 @@ def solve_frames(
     """
     if problem.frame_count == 0:
         raise InputError("frames", "at least one frame", "none")
+    result = _solve_frames(problem, solver, options, covariance)
+    again = getattr(problem, "relinearised", None)
+    nearer = None if again is None else again(result.x)
+    if nearer is not None:
+        spent = result.time
+        problem, result = nearer, _solve_frames(nearer, solver, options, covariance)
+        result = replace(result, time=result.time + spent)
+    return problem.view_frames(result)
+
+
+def _solve_frames(
+    problem: FrameProblem, solver: str | None, options: SolverOptions | None, covariance: bool
+) -> FrameResult:
     first = problem.frame(0)
     only_rows = (
         first.inequalities.height
@@ -325,12 +338,10 @@ def solve_frames(
         and not np.isfinite([first.lower, first.upper]).any()
     )
     if solver in (None, "cholesky") and not first.constrained:
-        result = _all_at_once(problem, covariance)
-    elif solver in (None, "active-set") and only_rows and hasattr(problem, "inequality_frames"):
-        result = _by_active_set(problem, options, covariance)
-    else:
-        result = _one_by_one(problem, first, solver, options, covariance)
-    return problem.view_frames(result)
+        return _all_at_once(problem, covariance)
+    if solver in (None, "active-set") and only_rows and hasattr(problem, "inequality_frames"):
+        return _by_active_set(problem, options, covariance)
+    return _one_by_one(problem, first, solver, options, covariance)
 
 
 def _by_active_set(problem: Any, options: SolverOptions | None, covariance: bool) -> FrameResult:

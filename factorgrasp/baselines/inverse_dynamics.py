@@ -11,10 +11,11 @@ from numpy.typing import ArrayLike
 
 from factorgrasp.errors import InputError
 from factorgrasp.problems.human_dynamics import HumanDynamics
+from factorgrasp.problems.human_dynamics_point import newton_euler
 from factorgrasp.problems.human_dynamics_sensors import Sensor
 from factorgrasp.problems.human_dynamics_settings import HumanDynamicsNoise
 from factorgrasp.problems.link_motion import LinkMotion
-from factorgrasp.problems.link_motion_spatial import cross_force, rotate_back, skew
+from factorgrasp.problems.link_motion_spatial import rotate_back, skew
 from factorgrasp.typing import FloatArray
 
 
@@ -53,17 +54,13 @@ def inverse_dynamics(
         ``[force; moment]`` on a link in its frame, N and Nm; links that are not named carry none.
     """
     tree, k, count = motion.tree, motion.kinematics(), len(motion)
-    momentum = (tree.spatial_inertia @ k.velocity[..., None])[..., 0]
-    net = (tree.spatial_inertia @ k.acceleration[..., None])[..., 0] + cross_force(k.velocity, momentum)
+    external = np.zeros((count, len(tree.links), 6))
     for link, wrench in (external_wrench or {}).items():
         value = np.asarray(wrench, dtype=float)
         if value.shape != (count, 6):
             raise InputError(f"external wrench on {link}", f"shape ({count}, 6)", str(value.shape))
-        net[:, motion.link(link)] -= value
-    f = np.zeros((count, len(tree.joints), 6))
-    for j in _from_leaves(tree.parents, tree.children):
-        f[:, j] = net[:, tree.children[j]]
-        net[:, tree.parents[j]] += (np.swapaxes(k.transform[:, j], 1, 2) @ f[:, j, :, None])[..., 0]
+        external[:, motion.link(link)] = value
+    f, residual = newton_euler(tree, k, external)
     torque = [
         (np.swapaxes(S, 1, 2) @ f[:, j, :, None])[..., 0] for j, S in enumerate(k.subspaces) if S is not None
     ]
@@ -75,7 +72,7 @@ def inverse_dynamics(
         np.concatenate(torque, axis=1) if torque else np.zeros((count, 0)),
         (R @ moment[..., None])[..., 0],
         (R @ f[..., :3, None])[..., 0],
-        net[:, tree.root],
+        residual,
     )
 
 
@@ -122,15 +119,3 @@ def original_map(
 ) -> HumanDynamics:
     """Latella 2018: every link without a wrench sensor touches nothing, whatever the hands may carry."""
     return HumanDynamics(motion, sensors, noise or HumanDynamicsNoise.latella2018())
-
-
-def _from_leaves(parents: ArrayLike, children: ArrayLike) -> list[int]:
-    """Joints in an order in which every joint comes before the one above it."""
-    up, down = np.asarray(parents), np.asarray(children)
-    order: list[int] = []
-    left = set(range(up.size))
-    while left:
-        ready = [j for j in left if not any(up[other] == down[j] for other in left)]
-        order += ready
-        left -= set(ready)
-    return order

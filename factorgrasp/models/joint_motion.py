@@ -9,11 +9,11 @@ import numpy as np
 
 from factorgrasp import lie
 from factorgrasp.errors import InputError
+from factorgrasp.models.state_noise import StateNoise
 from factorgrasp.signals import (
     choose_savgol,
     differentiate_rotations,
     savgol_derivatives,
-    savgol_noise_gain,
 )
 from factorgrasp.typing import BoolArray, FloatArray
 
@@ -33,6 +33,10 @@ class JointMotion:
         Frames without NaN.
     angle_gain, acceleration_gain : float
         Variance of a smoothed angle and of its second derivative (1/s^4) per variance of one angle: white noise through the filter.
+    cross_gain : float
+        Their covariance (1/s^2), likewise.
+    window : int
+        Samples of the filter: frames so far apart have independent errors.
     """
 
     q: FloatArray
@@ -41,6 +45,12 @@ class JointMotion:
     good: BoolArray
     angle_gain: float
     acceleration_gain: float
+    cross_gain: float
+    window: int
+
+    def state_noise(self, covariance: FloatArray) -> StateNoise:
+        """Noise of a motion made of these, from the covariance of one sample of the configuration."""
+        return StateNoise(covariance, self.angle_gain, self.acceleration_gain, self.cross_gain)
 
 
 def differentiate_configurations(model: Any, q: FloatArray, dt: float, bandwidth: float) -> JointMotion:
@@ -88,9 +98,9 @@ def differentiate_configurations(model: Any, q: FloatArray, dt: float, bandwidth
     good: BoolArray = np.asarray(
         np.isfinite(smooth).all(axis=1) & np.isfinite(v).all(axis=1) & np.isfinite(a).all(axis=1)
     )
-    return JointMotion(
-        smooth, v, a, good, savgol_noise_gain(window, ORDER, 0, dt), savgol_noise_gain(window, ORDER, 2, dt)
-    )
+    passed = StateNoise.through_savgol(np.ones(1), window, ORDER, dt)
+    gains = passed.position_gain, passed.acceleration_gain, passed.cross_gain
+    return JointMotion(smooth, v, a, good, *gains, window)
 
 
 def free_flyer(

@@ -17,10 +17,11 @@ from numpy.typing import ArrayLike
 from factorgrasp.errors import InputError
 from factorgrasp.problems.human_dynamics_sensors import Sensor
 from factorgrasp.problems.human_dynamics_settings import HumanDynamicsNoise
+from factorgrasp.problems.human_dynamics_state import MotionAcceleration, state_sensors, torque_turn
 from factorgrasp.problems.human_dynamics_system import HumanDynamicsSystem
 from factorgrasp.problems.human_dynamics_whitening import Whitening
-from factorgrasp.problems.link_motion import LinkKinematics
-from factorgrasp.problems.link_motion_pinocchio import PinocchioTree
+from factorgrasp.problems.link_motion import LinkKinematics, StateNoise
+from factorgrasp.problems.link_motion_pinocchio import PinocchioTree, neutral
 from factorgrasp.solvers.frames import FrameResult, FrameSolver
 from factorgrasp.status import Status
 from factorgrasp.typing import FloatArray
@@ -76,6 +77,9 @@ class OnlineHumanDynamics:
         As for the problem.
     covariance : bool
         Also compute sd of torques and covariances of external wrenches.
+    state_noise : StateNoise, optional
+        Of the configurations, as for a motion; it does not change over frames. Errors of poses are linearised at the
+        wrenches of the last frame.
     """
 
     def __init__(
@@ -86,6 +90,7 @@ class OnlineHumanDynamics:
         contacts: Sequence[str] = (),
         use_motion: bool = True,
         covariance: bool = True,
+        state_noise: StateNoise | None = None,
     ) -> None:
         self.tree, self.covariance = tree, covariance
         one = []
@@ -97,14 +102,28 @@ class OnlineHumanDynamics:
                 )
             one.append(replace(sensor, values=sensor.values[:1]))
         self.sensors = tuple(one)
-        self.system = HumanDynamicsSystem(tree.tree, self.sensors, noise, contacts, use_motion)
-        self._whitening = Whitening(self.system, self.sensors)
+        body, every = tree.tree, self.sensors
+        self._acceleration: MotionAcceleration | None = None
+        if state_noise is not None:
+            state_noise.check(6 * tree.floating + sum(map(len, body.dofs)), 1)
+            still = tree.kinematics(neutral(tree.model), np.zeros(tree.model.nv), np.zeros(tree.model.nv))
+            inner = state_sensors(body, state_noise, still, self.sensors, use_motion)
+            every, use_motion = (*every, *inner), use_motion and state_noise.acceleration_gain == 0.0
+            self._acceleration = next((s for s in inner if isinstance(s, MotionAcceleration)), None)
+        self._own = sum(s.size for s in every[len(self.sensors) :])
+        self._point: tuple[FloatArray, FloatArray] | None = None
+        self.system = HumanDynamicsSystem(
+            body, every, noise, contacts, use_motion, state_errors=state_noise is not None
+        )
+        self._whitening = Whitening(self.system, every)
         wanted = (
             [*self.system.columns.joint_wrench, *self.system.columns.external_wrench] if covariance else []
         )
+        self._turning = self.system.turning
+        wanted += list(self._turning.values()) if covariance else []
         self._solver = FrameSolver(self.system.pattern, wanted)
         self._places = {
-            sensor.name: where for sensor, where in zip(self.sensors, self.system.value_slices, strict=True)
+            sensor.name: where for sensor, where in zip(self.sensors, self.system.value_slices, strict=False)
         }
         self._owner = np.concatenate(
             [np.full(len(tree.tree.dofs[j]), j) for j in self.system.axes] or [np.empty(0)]
@@ -143,13 +162,34 @@ class OnlineHumanDynamics:
 
     def _finish(self, t: float, k: LinkKinematics, values: Values, started: float) -> HumanDynamicsFrame:
         rows = self._rows(values)
-        entries, rhs = self.system.raw(k, rows)
-        self._whitening.apply(entries, rhs, rows, slice(0, 1))
-        result = self._solver.solve(entries, rhs, self.covariance)
+        if not self.system.state_errors:
+            return self._read(t, k, self._solve(k, rows), started)
+        own = [np.zeros((1, self._own))]
+        if self._acceleration is not None:
+            measured = self._acceleration.read(self.system.tree, k)
+            own = [np.zeros((1, self._own - measured.shape[1])), measured]
+        rows = np.concatenate([rows, *own], axis=1)
+        if self._point is None:
+            self._keep(self._solve(k, rows))
+        if self._point is not None:
+            k = replace(k, external_wrench=self._point[0], joint_wrench=self._point[1])
+        result = self._solve(k, rows)
+        self._keep(result)
         return self._read(t, k, result, started)
 
+    def _solve(self, k: LinkKinematics, rows: FloatArray) -> FrameResult:
+        entries, rhs = self.system.raw(k, rows)
+        self._whitening.apply(entries, rhs, rows, slice(0, 1))
+        return self._solver.solve(entries, rhs, self.covariance)
+
+    def _keep(self, result: FrameResult) -> None:
+        """Wrenches at which the next frame is linearised."""
+        columns = self.system.columns
+        if result.status[0].ok:
+            self._point = result.x[:, columns.external_wrench], result.x[:, columns.joint_wrench]
+
     def _rows(self, values: Values) -> FloatArray:
-        size = self.system.value_slices[-1].stop if self.sensors else 0
+        size = self.system.value_slices[len(self.sensors) - 1].stop if self.sensors else 0
         if isinstance(values, np.ndarray):
             if values.shape != (size,):
                 raise InputError(
@@ -174,9 +214,18 @@ class OnlineHumanDynamics:
         sd, cov = np.empty(0), np.empty((0, 6, 6))
         if self.covariance:
             joints = wrench.shape[0]
-            P = np.stack(result.marginals)[:, 0]
-            sd = np.sqrt(np.maximum(np.einsum("di,dij,dj->d", S, P[self._owner], S), 0.0))
+            links = len(self.system.tree.links)
+            P = np.stack(result.marginals[: joints + links])[:, 0]
+            variance = np.einsum("di,dij,dj->d", S, P[self._owner], S)
             cov = P[joints:]
+            for (j, group), block in zip(
+                self._turning.items(), result.marginals[joints + links :], strict=True
+            ):
+                own = np.flatnonzero(self._owner == j)
+                reader = np.concatenate([S[own], torque_turn(S[own].T[None], wrench[j][None])[0]], axis=1)
+                variance[own] = np.einsum("di,ij,dj->d", reader, block[0], reader)
+                torque[own] += reader[:, 6:] @ x[group[6:]]
+            sd = np.sqrt(np.maximum(variance, 0.0))
         self.frames += 1
         latency = time.perf_counter() - started
         self.worst_latency = max(self.worst_latency, latency)

@@ -10,17 +10,18 @@ from typing import Any
 import numpy as np
 
 from factorgrasp.models.human import HumanBody
-from factorgrasp.models.joint_motion import differentiate_configurations
+from factorgrasp.models.joint_motion import ORDER, differentiate_configurations
 from factorgrasp.problems.human_dynamics_sensors import Accelerometer, ExternalWrench, Sensor, plate_wrench
 from factorgrasp.problems.human_dynamics_settings import HumanDynamicsNoise
-from factorgrasp.problems.link_motion import LinkMotion
+from factorgrasp.problems.link_motion import LinkMotion, StateNoise
 from factorgrasp.problems.link_motion_pinocchio import PinocchioTree
 from factorgrasp.problems.link_motion_spatial import rotate_back
 from factorgrasp.recordings.forces import ForceRecording
+from factorgrasp.signals import choose_savgol
 from factorgrasp.simulation.human_motion import (
     JointTrajectory,
 )
-from factorgrasp.typing import BoolArray, FloatArray
+from factorgrasp.typing import BoolArray, FloatArray, IntArray
 
 RATE = 100.0
 """Hz, of all that is recorded."""
@@ -179,15 +180,38 @@ class HumanRecording:
             out[link] = ForceRecording(self.t, f, point, about - np.cross(point, f), link)
         return out
 
-    def foot_sensors(self, motion: LinkMotion, keep: BoolArray | slice = slice(None)) -> list[ExternalWrench]:
-        """The plates as sensors at the frames of `motion`, with the covariance of their noise."""
+    @cached_property
+    def state_noise(self) -> StateNoise:
+        """Noise of the configurations of :attr:`measured_motion`, for its ``with_state_noise``."""
+        n, tree = self.noise, PinocchioTree(self.body.model())
+        sd = np.array([n.position] * 3 + [n.orientation] * 3 + [n.angle] * (tree.model.nv - 6))
+        return StateNoise.through_savgol(sd[tree.tangent_columns] ** 2, self.filter_window, ORDER, 1.0 / RATE)
+
+    @property
+    def filter_window(self) -> int:
+        """Samples of the filter of :attr:`measured_motion`: frames so far apart have independent errors."""
+        return choose_savgol(self.noise.bandwidth, 1.0 / RATE, ORDER)
+
+    def foot_sensors(
+        self,
+        motion: LinkMotion,
+        keep: BoolArray | IntArray | slice = slice(None),
+        unloaded: float | None = None,
+    ) -> list[ExternalWrench]:
+        """The plates as sensors at the frames of `motion`, with the covariance of their noise.
+
+        A plate that nobody stands on reads zero without noise here; `unloaded` is the variance (N^2, (Nm)^2) to state of it then.
+        """
         n = self.noise
         variance = np.array([n.force**2] * 3 + [n.moment**2] * 3)
         out = []
         for link, plate in self.plates.items():
             origin = motion.p[:, motion.link(link)]
             values = plate_wrench(plate.force[keep], plate.point[keep], plate.moment[keep], origin)
-            out.append(ExternalWrench(values, variance, f"plate under {link}", link=link, frame="world"))
+            stated = variance
+            if unloaded is not None:
+                stated = np.where(np.any(plate.force[keep], axis=1)[:, None], variance, unloaded)
+            out.append(ExternalWrench(values, stated, f"plate under {link}", link=link, frame="world"))
         return out
 
     def hand_sensors(self, keep: BoolArray | slice = slice(None)) -> list[ExternalWrench]:
@@ -202,7 +226,9 @@ class HumanRecording:
             out.append(ExternalWrench(values[keep], sd**2, f"force sensor at {link}", link=link))
         return out
 
-    def imus(self, keep: BoolArray | slice = slice(None), links: Sequence[str] = IMU_LINKS) -> list[Sensor]:
+    def imus(
+        self, keep: BoolArray | IntArray | slice = slice(None), links: Sequence[str] = IMU_LINKS
+    ) -> list[Sensor]:
         """Accelerometers at the centres of mass of links, in their axes."""
         rng = np.random.default_rng([self.seed, 4])
         out: list[Sensor] = []
