@@ -10,12 +10,14 @@ from typing import Any
 
 import numpy as np
 
+from factorgrasp import lie
 from factorgrasp.body_state import MAX_GAP, POSTURE_SD, BodyState, estimate_state, solve_posture
 from factorgrasp.errors import InputError
 from factorgrasp.human_dynamics_joint_table import check_stamps
 from factorgrasp.models.human import HumanBody, configuration
 from factorgrasp.problems.body_observations import BodyObservations, ObservedBody, Placement, poses_only
 from factorgrasp.problems.human_dynamics_settings import PerName
+from factorgrasp.problems.link_motion import StateNoise
 from factorgrasp.problems.link_motion_files import link_poses
 from factorgrasp.problems.link_motion_pinocchio import PinocchioTree
 from factorgrasp.recordings.opensim import MarkerRecording, read_osim_markers, read_trc
@@ -334,6 +336,16 @@ def _check_upright(model: Any, state: BodyState, gravity: Vector) -> None:
             "[model] gravity", "gravity along the body of who stands", f"{list(gravity)}, where the body is upright along {axis}",
             f"For a laboratory with {axis} up say gravity = {turned} in [model]",
         )  # fmt: skip
+
+
+def state_noise(state: BodyState, tree: PinocchioTree) -> StateNoise:
+    """Variances of the configurations at the good frames, in the order that a link motion has; accelerations have theirs apart."""
+    variance = state.q_variance[state.good].copy()
+    if tree.floating:
+        R = lie.quaternion_wxyz_to_matrix(np.roll(state.q[state.good, 3:7], 1, axis=1))
+        P = np.swapaxes(R, 1, 2) @ state.q_covariance[state.good, :3, :3] @ R
+        variance[:, :3] = np.diagonal(P, axis1=1, axis2=2)
+    return StateNoise(variance[:, tree.tangent_columns])
 
 
 def _variances(model: Any, state: BodyState) -> dict[str, PerName]:

@@ -88,12 +88,13 @@ def read_body_motion(table: Mapping[str, Any], base_dir: Path) -> BodyMotion:
             raise InputError(
                 "[model] base", '"floating", as the body is seen to move in the world', '"fixed"'
             )
-        from factorgrasp.human_dynamics_markers import from_observations
+        from factorgrasp.human_dynamics_markers import from_observations, state_noise
 
         state, variances = from_observations(pin_model, body, motion, file, base_dir, gravity)
         tree = PinocchioTree(pin_model, gravity=gravity)
         good = state.good
         found = tree.motion(state.t[good], state.q[good], state.qd[good], state.qdd[good])
+        found = found.with_state_noise(state_noise(state, tree))
         names = np.array([str(name) for name in list(pin_model.names)[2:]])
         extras = {"q": state.q, "q_sd": np.sqrt(state.q_variance), "q_names": names}
         return _known(state.t, good, found, variances, file if archive else None, extras)
@@ -226,18 +227,26 @@ def _from_joints(
             "[motion]", "a stretch without gaps that is longer than the filter of the derivatives", "none"
         )
     tree = PinocchioTree(model, gravity=gravity)
+    # Noise of a slower source has the same density in the filter's band, which white noise of the faster clock must have.
+    denser = max(1.0, float(np.median(np.diff(t))) / dt)
+    gain = denser * moved.acceleration_gain
     variances: dict[str, PerName] = {}
     if (angle := get(motion, "angle_sd", float, where, None)) is not None:
-        variances["joint_acceleration"] = _variance(angle, "angle_sd") * moved.acceleration_gain
+        variances["joint_acceleration"] = _variance(angle, "angle_sd") * gain
     position, turn = (get(motion, key, float, where, None) for key in ("position_sd", "orientation_sd"))
     if (position is None) != (turn is None):
         raise InputError("[motion] position_sd, orientation_sd", "both or none", "one of them")
     if position is not None:
         parts = _variance(position, "position_sd"), _variance(turn, "orientation_sd")
-        variances["link_acceleration"] = tuple(moved.acceleration_gain * v for v in parts for _ in range(3))
-    return _known(
-        clock, good, tree.motion(clock[good], moved.q[good], moved.qd[good], moved.qdd[good]), variances
-    )
+        variances["link_acceleration"] = tuple(gain * v for v in parts for _ in range(3))
+    found = tree.motion(clock[good], moved.q[good], moved.qd[good], moved.qdd[good])
+    if angle is not None and not given and (position is not None or not floating):
+        # Poses are as noisy as they are stated to be: lever arms and directions with them.
+        sd = np.full(model.nv, angle)
+        if floating:
+            sd[:3], sd[3:6] = position, turn
+        found = found.with_state_noise(moved.state_noise(denser * sd[tree.tangent_columns] ** 2))
+    return _known(clock, good, found, variances)
 
 
 def _as_given(
