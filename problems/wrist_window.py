@@ -288,7 +288,11 @@ class Window:
         """All pairs of the window as one, once a frame."""
         counts = np.array([len(p) for p in self.pairs])
         filled = [p for p in self.pairs if len(p)]
-        self._joined = (counts, Pairs.join(filled) if filled else None, np.repeat(np.arange(counts.size), counts))
+        self._joined = (
+            counts,
+            Pairs.join(filled) if filled else None,
+            np.repeat(np.arange(counts.size), counts),
+        )
 
     def _smooth(self) -> None:
         self._join()
@@ -369,7 +373,9 @@ class Window:
         information = H[np.ix_(new, new)] - half[:, :-1].T @ half[:, :-1]
         vector = g[new] - half[:, :-1].T @ half[:, -1]
         R, x, layout = self._at
-        self.prior = Prior(R[1].copy(), x[1].copy(), layout.copy(), 0.5 * (information + information.T), vector)
+        self.prior = Prior(
+            R[1].copy(), x[1].copy(), layout.copy(), 0.5 * (information + information.T), vector
+        )
         self.left = self.t[0]
         self.t, self.pairs, self._roots = self.t[1:], self.pairs[1:], self._roots[1:]
         self.R, self.x = self.R[1:], self.x[1:]
