@@ -75,6 +75,8 @@ def half_hidden(fraction: float, kind: str = "skin") -> tuple[Hidden, ...]:
 
 CLOSE = tuple(tuple(0.55 * c for c in point) for point in PALM_POINTS)
 """A small hand: its knuckles are 13 mm apart, its markers 12 mm wide."""
+OVERLAPPING = tuple((0.094, 0.0095, 0.0) if k == 2 else point for k, point in enumerate(PALM_POINTS))
+"""Index and middle marker 9.5 mm apart: one is stuck over the edge of the other."""
 
 ROWS = (
     Row("nominal"),
@@ -99,7 +101,8 @@ ROWS = (
     Row("one marker 0.2 hidden", HandScene(hidden=half_hidden(0.2))),
     Row("one marker half hidden", HandScene(hidden=half_hidden(0.5))),
     Row("half hidden by grey cloth", HandScene(hidden=half_hidden(0.5, "cloth"))),
-    Row("touching (9.7 px apart)", layout=CLOSE),
+    Row("touching (10 px apart)", layout=CLOSE),
+    Row("overlapping (7 px apart)", layout=OVERLAPPING),
     Row(
         "8 mm marker at 1 m",
         HandScene(marker_diameter=0.008),

@@ -37,7 +37,10 @@ Kind = Literal["whole", "hidden", "split"]
 _MARGIN = 8
 _MOST_COMPONENTS = 200
 _MOST_EXAMINED = 40
+_MOST_FUZZY = 3.5
+"""Size of a component relative to its sure inside from which only the inside is taken."""
 _FEW = 6
+"""Blobs: with fewer, another lamp is considered."""
 _SEVERAL = 24
 """px: a component of that size may be several markers."""
 _UNKNOWN_DEPTH_VARIANCE = 1.0
@@ -432,7 +435,10 @@ def _components(seeds: Any, least: int, most: int, cv2: Any) -> tuple[Any, list[
                 sure, 8, cv2.CV_16U, cv2.CCL_BBDT
             )
             sound = [i for i in range(1, found) if parts[i, cv2.CC_STAT_AREA] >= max(least, 4)]
-            if (len(sound) > 1 or (count > most and sound)) and following + len(sound) < 60_000:
+            core = sum(int(parts[i, cv2.CC_STAT_AREA]) for i in sound)
+            # Grey cloth has the colour of a marker's edge, and joins the marker that it half hides.
+            fuzzy = count > most or count > _MOST_FUZZY * core
+            if sound and (len(sound) > 1 or fuzzy) and following + len(sound) < 60_000:
                 labels[box][labels[box] == label] = 0
                 for i in sound:
                     labels[box][inner == i] = following
