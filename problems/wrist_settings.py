@@ -148,7 +148,7 @@ class WristSettings:
 
     lag: int = 10
     layout: LayoutUse = "estimate"
-    loss_scale: float = 5.0
+    loss_scale: float = 8.0
     start_frames: int = 15
 
     def __post_init__(self) -> None:

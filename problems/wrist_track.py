@@ -45,23 +45,26 @@ class CameraPose:
         ``p_c_w0``, m.
     covariance : (6, 6) ndarray
         [rotation; position]: rotation as right perturbation ``R_c_w0 Exp(d)``, position in the camera frame; zero when the pose was given
-        as exact, or when it *defines* W0.
+        as exact.
     frames : int
         Frames that it was averaged over; 0: given.
+    layout_gain : (6, 3n) ndarray
+        How an error of the layout moves this pose; empty when it does not. A rigid error of the layout then cancels between W0 and W.
     """
 
     rotation: FloatArray
     position: FloatArray
     covariance: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
     frames: int = 0
+    layout_gain: FloatArray = field(default_factory=lambda: np.zeros((6, 0)))
 
 
 @dataclass(frozen=True, eq=False)
 class WristTrack:
     """Pose of the moving wrist frame ``W`` in the start frame ``W0``, one row a frame.
 
-    A frame in which the wrist was lost has NaN pose and an infinite variance; a gap that was bridged has the prediction (or the smoothed
-    pose) with a covariance that grows.
+    A gap has the prediction, or the smoothed pose, with a covariance that grows; frames before the hand was found for the first time have
+    NaN poses and infinite variances.
 
     Attributes
     ----------
@@ -76,8 +79,8 @@ class WristTrack:
     angular_velocity : (n, 3) ndarray
         Of W, in W, rad/s.
     covariance : (n, 6, 6) ndarray
-        [rotation; translation]: rotation as right perturbation ``R_w0_w Exp(d)`` (rad, in W), translation in W0 (m). Of the pose seen from
-        the camera; that of W0 itself is in `camera_pose`.
+        [rotation; translation]: rotation as right perturbation ``R_w0_w Exp(d)`` (rad, in W), translation in W0 (m). What is not known of
+        W0 itself is included.
     velocity_covariance : (n, 6, 6) ndarray
         [angular velocity (in W); velocity (in W0)].
     association : (m,) ndarray of int

@@ -37,6 +37,10 @@ scenarios: dict[str, Scenario] = {
         "factorgrasp.simulation.cehajic2015:cehajic2015",
         "grasp pose, rigid object, wrist at rest (Cehajic 2015, section V; options motion='exciting' | 'printed')",
     ),
+    "cordella2014": Scenario(
+        "factorgrasp.simulation.wrist:cordella2014",
+        "wrist pose from six blobs (Cordella 2014; option motion='abduction' | 'flexion' | 'pronation' | 'three_axes' | 'reach')",
+    ),
     "grasp_regrasp": Scenario(
         "factorgrasp.simulation.cehajic2015:grasp_regrasp",
         "grasp pose as in cehajic2015, and the hand takes another grasp half way (default 10 deg, 70 mm)",
