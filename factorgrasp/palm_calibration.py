@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -10,9 +11,10 @@ import numpy as np
 from factorgrasp.errors import InputError, NotSolvedError
 from factorgrasp.losses import make_loss
 from factorgrasp.models.camera import Camera
+from factorgrasp.models.marker_files import write_layout
 from factorgrasp.models.markers import MarkerLayout
 from factorgrasp.problems.palm_labels import MOST_POINTS, Labelling, label_points
-from factorgrasp.problems.palm_layout import PalmConvention, PalmLayout, PalmView, palm_frame
+from factorgrasp.problems.palm_layout import PalmConvention, PalmLayout, PalmView, in_palm_frame, palm_frame
 from factorgrasp.recordings.blobs import BlobFrame, BlobRecording
 from factorgrasp.solvers.solve import solve
 from factorgrasp.typing import FloatArray, IntArray
@@ -60,6 +62,12 @@ class PalmCalibration:
     consistency: float
     scale: float
 
+    def save(self, path: str | Path) -> Path:
+        """Write the layout as JSON, to be used again: :func:`factorgrasp.models.marker_files.read_layout`."""
+        return write_layout(
+            path, self.layout, frames=self.frames.tolist(), consistency=self.consistency, scale=self.scale
+        )
+
 
 def calibrate_palm(
     blobs: BlobRecording,
@@ -69,12 +77,12 @@ def calibrate_palm(
     template: MarkerLayout | None = None,
     frames: int = 30,
     look: int = 300,
-    systematic_sd: float = 3e-4,
+    systematic_sd: float = 1e-4,
 ) -> PalmCalibration:
     """The layout from the first frames in which all markers are seen with depth.
 
-    Every labelling of a frame's points is compared with a template hand of any usual size; with the layout of the frames before once there is
-    one. Layout and poses then come from one least-squares fit, weighted by the blobs' covariances.
+    Every labelling of a frame's points is compared with a template hand of any usual size; with the layout of the frames before once
+    there is one. Layout and poses then come from one least-squares fit, weighted by the blobs' covariances.
 
     Parameters
     ----------
@@ -104,7 +112,11 @@ def calibrate_palm(
     if side not in ("right", "left") or facing not in ("back", "palm"):
         raise InputError("side, facing", "right or left, and back or palm", f"{side!r}, {facing!r}")
     if frames < 1 or look < 1 or not 0.0 <= systematic_sd < 0.1:
-        raise InputError("frames, look, systematic_sd", "at least 1, at least 1, metres", f"{frames}, {look}, {systematic_sd:g}")
+        raise InputError(
+            "frames, look, systematic_sd",
+            "at least 1, at least 1, metres",
+            f"{frames}, {look}, {systematic_sd:g}",
+        )
     if template is None:
         standard = MarkerLayout.palm()
         mirror = np.array([1.0, -1.0 if (side == "left") != (facing == "palm") else 1.0, 1.0])
@@ -114,7 +126,9 @@ def calibrate_palm(
     convention = PalmConvention.of(template.names)
     views, used, rows, scale = _collect(blobs, camera, template, frames, look, convention)
     start = np.mean([(view.points - view.position) @ view.rotation for view in views], axis=0)
-    problem = PalmLayout(template.names, start, views, convention, make_loss("huber", 3.0) if len(views) > 2 else None)
+    problem = PalmLayout(
+        template.names, start, views, convention, make_loss("huber", 3.0) if len(views) > 2 else None
+    )
     estimate = solve(problem)
     if not estimate.solved:
         raise NotSolvedError(f"palm calibration: {estimate.message}")
@@ -138,13 +152,16 @@ def calibrate_palm(
 
 def _moved(layout: MarkerLayout) -> FloatArray:
     """Covariance (3n, 3n) in the palm frame of coordinates that each had variance 1: the frame moves with its markers."""
-    from factorgrasp.problems.palm_layout import in_palm_frame
-
     return in_palm_frame(MarkerLayout(layout.names, layout.points, np.eye(3 * len(layout)))).covariance
 
 
 def _collect(
-    blobs: BlobRecording, camera: Camera, template: MarkerLayout, most: int, look: int, convention: PalmConvention
+    blobs: BlobRecording,
+    camera: Camera,
+    template: MarkerLayout,
+    most: int,
+    look: int,
+    convention: PalmConvention,
 ) -> tuple[list[PalmView], list[int], list[IntArray], float]:
     """Labelled frames, their numbers, the blobs of the markers, and the size of the hand."""
     markers = len(template)
