@@ -101,9 +101,7 @@ def read_camera(table: Mapping[str, Any]) -> tuple[Camera, CameraPose | None]:
     distortion = get(table, "distortion", tuple[float, ...], where, ())
     rate = get(table, "rate", float, where, 30.0)
     try:
-        camera = Camera(
-            float(fx), float(fy), float(cx), float(cy), width, height, tuple(distortion), rate
-        )
+        camera = Camera(float(fx), float(fy), float(cx), float(cy), width, height, tuple(distortion), rate)
     except InputError as error:
         raise InputError(
             error.field.replace("camera:", where), error.expected, error.found, error.hint
@@ -158,7 +156,9 @@ def read_layout(table: Mapping[str, Any], base_dir: Path) -> MarkerLayout | None
 
 
 def _layout(points: np.ndarray, table: Mapping[str, Any], where: str) -> MarkerLayout:
-    default = PALM_NAMES if len(points) == len(PALM_NAMES) else tuple(f"marker_{k + 1}" for k in range(len(points)))
+    default = (
+        PALM_NAMES if len(points) == len(PALM_NAMES) else tuple(f"marker_{k + 1}" for k in range(len(points)))
+    )
     names = get(table, "names", tuple[str, ...], where, default)
     if len(names) != len(points):
         raise InputError(place(where, "names"), f"{len(points)} names, one a marker", f"{len(names)}")
@@ -175,9 +175,7 @@ def _layout(points: np.ndarray, table: Mapping[str, Any], where: str) -> MarkerL
     try:
         return MarkerLayout.with_sd(tuple(names), points, float(sds[0]) if sds.size == 1 else sds)
     except InputError as error:
-        raise InputError(
-            place(where, "layout"), error.expected, error.found, error.hint
-        ) from error
+        raise InputError(place(where, "layout"), error.expected, error.found, error.hint) from error
 
 
 def _layout_file(path: Path, table: Mapping[str, Any]) -> MarkerLayout:
@@ -248,7 +246,9 @@ def blob_remarks(blobs: BlobRecording, camera: Camera) -> tuple[str, ...]:
         )
     known = np.isfinite(blobs.depth)
     if not known.any():
-        out.append("no blob has a depth: two poses explain a nearly flat hand's pixels, and the answer may be ambiguous")
+        out.append(
+            "no blob has a depth: two poses explain a nearly flat hand's pixels, and the answer may be ambiguous"
+        )
     elif known.mean() < 0.5:
         out.append(f"only {100.0 * known.mean():.0f} % of the blobs have a depth")
     step = float(np.median(np.diff(blobs.t))) if len(blobs) > 1 else float("nan")

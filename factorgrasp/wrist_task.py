@@ -86,10 +86,11 @@ class WristTask:
         from factorgrasp.solvers.solve import solve
 
         try:
-            if self.method == "batch":
-                solved = cast(WristPoseEstimate, solve(self.problem, solver))
-            else:
-                solved = self._forward()
+            solved = (
+                cast(WristPoseEstimate, solve(self.problem, solver))
+                if self.method == "batch"
+                else self._forward()
+            )
         except NotSolvedError as error:
             solved = self._nothing(str(error))
         measures = wrist_measures(solved.track, self.hand)
@@ -144,7 +145,12 @@ class WristTask:
         problem = self.problem
         started = time.perf_counter()
         first, newest = track_forward(
-            problem.camera, problem.blobs, problem.markers, problem.association, problem.noise, problem.settings
+            problem.camera,
+            problem.blobs,
+            problem.markers,
+            problem.association,
+            problem.noise,
+            problem.settings,
         )
         elapsed = time.perf_counter() - started
         problem.__dict__["first_pass"] = first
@@ -174,9 +180,7 @@ class WristTask:
     def _start_frame(self, first: FirstPass, nodes: tuple[Node, ...], markers: MarkerLayout) -> CameraPose:
         problem = self.problem
         blobs = problem.blobs
-        start = StartFrame(
-            problem.camera, markers.points, markers.covariance, problem.settings.start_frames
-        )
+        start = StartFrame(problem.camera, markers.points, markers.covariance, problem.settings.start_frames)
         usual = float(np.nanmedian(blobs.depth)) if np.isfinite(blobs.depth).any() else 0.8
         C = blob_covariances(
             problem.camera, problem.noise, blobs.depth, usual, blobs.covariance_uv, blobs.covariance_depth
@@ -234,7 +238,8 @@ class WristTask:
         found = 1.0 - float(np.mean(track.lost))
         if found < LEAST_FOUND:
             return Status.UNOBSERVABLE, (
-                f"the hand was found in {100.0 * found:.0f} % of the frames only; check the layout, the units of the depth and the intrinsics"
+                f"the hand was found in {100.0 * found:.0f} % of the frames only; check the layout, the units of the depth and the "
+                "intrinsics"
             )
         return status, message
 

@@ -84,8 +84,14 @@ def wrist_measures(
     seed : int
         Of the draws: the same track gives the same numbers.
     """
-    R = track.rotation
-    P = np.where(np.isfinite(track.covariance), track.covariance, np.nan)
+    # A pose of a frame without a measurement is a guess, and no measure may rest on it.
+    unknown_pose = track.lost[:, None, None]
+    R = np.where(unknown_pose, np.nan, track.rotation)
+    P = np.where(unknown_pose | ~np.isfinite(track.covariance), np.nan, track.covariance)
+    position, velocity, rate = (
+        np.where(track.lost[:, None], np.nan, values)
+        for values in (track.position, track.velocity, track.angular_velocity)
+    )
     signs = isb_signs(hand)
     angles = signs * wrist_angles(R)
     variance = np.einsum("nii->ni", angle_covariance(R, P[:, :3, :3]))
@@ -101,8 +107,7 @@ def wrist_measures(
             "the track is not smoothed over the whole recording: its noise makes ranges of motion too large"
         )
     drawn = sample_tracks(
-        track.t, R, track.position, track.velocity, track.angular_velocity, P, track.velocity_covariance,
-        samples, seed,
+        track.t, R, position, velocity, rate, P, track.velocity_covariance, samples, seed,
     )  # fmt: skip
     drawn_angles = signs * wrist_angles(drawn.rotation)
     ranges = tuple(
@@ -116,9 +121,9 @@ def wrist_measures(
         angles,
         sd,
         ranges,
-        _peak(track.t, track.angular_velocity, drawn.angular_velocity, "rad/s"),
-        _peak(track.t, track.velocity, drawn.velocity, "m/s"),
-        movements(track.t, track.position, track.velocity, drawn.position, drawn.velocity),
+        _peak(track.t, rate, drawn.angular_velocity, "rad/s"),
+        _peak(track.t, velocity, drawn.velocity, "m/s"),
+        movements(track.t, position, velocity, drawn.position, drawn.velocity),
         tuple(words),
     )
 
