@@ -7,13 +7,14 @@ All three score a blob given to a marker by its predicted density in (u, v, z) a
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.stats import chi2
 
 from factorgrasp.problems.wrist_settings import Method
-from factorgrasp.typing import FloatArray, IntArray
+from factorgrasp.typing import BoolArray, FloatArray, IntArray
 
 DEPTH_RANGE = 1.0
 """m over which the depth of clutter is taken to be spread."""
@@ -101,7 +102,7 @@ def assign(
         return Assignment(nobody, 0.0)
     deep = np.isfinite(covariance[:, 2, 2]) & np.isfinite(uvz[:, 2])
     distance, logdet = _distances(predicted, uvz, covariance, deep)
-    limits = np.where(deep, chi2.ppf(gate, 3), chi2.ppf(gate, 2))
+    limits = np.where(deep, _limit(gate, 3), _limit(gate, 2))
     inside = distance <= limits[:, None]
     if not inside.any():
         return Assignment(nobody, 0.0)
@@ -115,8 +116,13 @@ def assign(
     return _joint(predicted, uvz, covariance, deep, inside, reward)
 
 
+@cache
+def _limit(gate: float, rows: int) -> float:
+    return float(chi2.ppf(gate, rows))
+
+
 def _distances(
-    predicted: Prediction, uvz: FloatArray, covariance: FloatArray, deep: FloatArray
+    predicted: Prediction, uvz: FloatArray, covariance: FloatArray, deep: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
     """Squared Mahalanobis distance (m, n) of every blob to every marker, and the logarithm of the covariance's determinant."""
     r = np.where(np.isfinite(uvz), uvz, 0.0)[:, None] - predicted.uvz[None]
@@ -162,8 +168,8 @@ def _joint(
     predicted: Prediction,
     uvz: FloatArray,
     covariance: FloatArray,
-    deep: FloatArray,
-    inside: FloatArray,
+    deep: BoolArray,
+    inside: BoolArray,
     reward: FloatArray,
 ) -> Assignment:
     """The most probable joint assignment: markers one by one, the best `BEAM` hypotheses kept.
@@ -232,7 +238,7 @@ class _Beam:
         self.A: FloatArray = np.zeros((1, 6, 6))
         self.b: FloatArray = np.zeros((1, 6))
         self.c: FloatArray = np.zeros(1)
-        self.used: FloatArray = np.zeros((1, blobs), dtype=bool)
+        self.used: BoolArray = np.zeros((1, blobs), dtype=bool)
         self.owner: IntArray = np.full((1, blobs), -1, dtype=np.intp)
         self.score: FloatArray = np.zeros(1)
 

@@ -95,9 +95,9 @@ class WristGraph:
                 )
                 root = batch.roots[i - 1]
                 out[:D] = root @ e[0]
-                for block, J in ((0, first), (2, second)):
+                for place, J in ((0, first), (2, second)):
                     whole = root @ J[0]
-                    blocks[block][:D], blocks[block + 1][:D] = whole[:, :3], whole[:, 3:]
+                    blocks[place][:D], blocks[place + 1][:D] = whole[:, :3], whole[:, 3:]
             if len(pairs):
                 layout = values.atVector(LAYOUT).reshape(-1, 3) if estimated else self.points
                 r, J_pose, J_point = self._markers(pairs, R, x, layout)

@@ -21,13 +21,12 @@ from factorgrasp.least_squares import LeastSquares
 from factorgrasp.losses import GemanMcClure
 from factorgrasp.models.camera import Camera
 from factorgrasp.models.markers import MarkerLayout
-from factorgrasp.problems.wrist_assign import Rates, assign
+from factorgrasp.problems.wrist_assign import Prediction, Rates, assign
 from factorgrasp.problems.wrist_chain import Marginals, marginals
 from factorgrasp.problems.wrist_estimate import WristPoseEstimate, make_view
 from factorgrasp.problems.wrist_graph import WristGraph
 from factorgrasp.problems.wrist_model import NODE_SIZE, Pairs, blob_covariances, predict, roots
 from factorgrasp.problems.wrist_rows import Batch, Rows
-from factorgrasp.problems.wrist_search import Prediction
 from factorgrasp.problems.wrist_settings import WristAssociation, WristNoise, WristSettings
 from factorgrasp.problems.wrist_system import System
 from factorgrasp.problems.wrist_track import CameraPose
@@ -236,7 +235,7 @@ class WristPose:
         """(3n, 3n) of the layout's prior; None when it is not estimated."""
         if not self.estimates_layout:
             return None
-        return np.linalg.inv(self.markers.covariance + 1e-12 * np.eye(3 * len(self.markers)))
+        return np.asarray(np.linalg.inv(self.markers.covariance + 1e-12 * np.eye(3 * len(self.markers))))
 
     @cached_property
     def variables(self) -> tuple[Variable, ...]:
@@ -408,7 +407,11 @@ class WristPose:
 
     @cached_property
     def _graph(self) -> WristGraph:
-        prior = None if self.layout_information is None else np.linalg.cholesky(self.layout_information).T
+        prior = (
+            None
+            if self.layout_information is None
+            else np.asarray(np.linalg.cholesky(self.layout_information).T)
+        )
         return WristGraph(self._posed.batch, self.markers.points, prior, self.loss)
 
     def factor_graph(self, _state: State | None = None) -> Any:

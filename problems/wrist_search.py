@@ -15,7 +15,7 @@ from factorgrasp import lie
 from factorgrasp.models.camera import Camera
 from factorgrasp.problems.wrist_assign import Assignment, Prediction, Rates, assign
 from factorgrasp.problems.wrist_model import predict, roots
-from factorgrasp.typing import FloatArray
+from factorgrasp.typing import FloatArray, IntArray
 
 MARGIN = 5.0
 """Logarithm of the odds against the second best pose that is asked for."""
@@ -165,7 +165,7 @@ def _rigid(source: FloatArray, target: FloatArray) -> tuple[FloatArray, FloatArr
 
 def _rank(
     camera: Camera, points: FloatArray, R: FloatArray, p: FloatArray, uvz: FloatArray, covariance: FloatArray
-) -> FloatArray:
+) -> IntArray:
     """Poses in the order of how many markers have a blob nearby, and how near."""
     seen = np.einsum("kij,nj->kni", R, points) + p[:, None]
     uv = camera.project(seen)
@@ -283,7 +283,7 @@ def fit(
         R, p = R @ lie.so3_exp(step[:3]), p + step[3:]
         if float(step @ H @ step) < 1e-8:
             break
-    return R, p, np.linalg.inv(H)
+    return R, p, np.asarray(np.linalg.inv(H))
 
 
 def _same(found: Found, R: FloatArray, p: FloatArray, angle: float, distance: float) -> bool:

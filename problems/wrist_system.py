@@ -115,9 +115,9 @@ class System:
         turn, way, layout = [], [], []
         for name, rows, nodes in self._marker_terms:
             node = self.batch.pairs.node[rows]
-            for i in nodes:
-                if np.any(node == i):
-                    rotation, motion = self._names(i)
+            for number in nodes:
+                if np.any(node == number):
+                    rotation, motion = self._names(number)
                     turn.append(jacobian.places(name, rotation))
                     way.append(jacobian.places(name, motion))
             if self._root is not None:
@@ -128,8 +128,8 @@ class System:
         for name, steps in self._motion_terms:
             seen: dict[str, int] = {}
             for i in steps:
-                for side, node in enumerate((i, i + 1)):
-                    for variable, columns in zip(self._names(node), (slice(0, 3), slice(3, D)), strict=True):
+                for side, end in enumerate((i, i + 1)):
+                    for variable, columns in zip(self._names(end), (slice(0, 3), slice(3, D)), strict=True):
                         width = columns.stop - columns.start
                         start = seen.get(variable, 0)
                         part = jacobian.places(name, variable)[start : start + D * width]

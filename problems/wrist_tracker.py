@@ -5,14 +5,14 @@ Everything here is in the camera frame; ``W0`` enters only when results are read
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from factorgrasp.models.camera import Camera
 from factorgrasp.models.markers import MarkerLayout
 from factorgrasp.problems.wrist_assign import Prediction, Rates, assign
-from factorgrasp.problems.wrist_flat import Flat, flat_search, rival
+from factorgrasp.problems.wrist_flat import flat_search
 from factorgrasp.problems.wrist_model import NODE_SIZE, Pairs, blob_covariances, predict, roots
 from factorgrasp.problems.wrist_search import Found, Guess, prediction, search
 from factorgrasp.problems.wrist_settings import WristAssociation, WristNoise, WristSettings
@@ -107,10 +107,10 @@ class WristTracker:
         self.camera, self.markers = camera, markers
         self.association, self.noise, self.settings = association, noise, settings
         self.size = NODE_SIZE[noise.motion]
-        prior = None
+        prior: FloatArray | None = None
         if settings.layout == "estimate" and np.any(markers.covariance > 0.0):
             # An exact coordinate among uncertain ones still needs a finite weight.
-            prior = np.linalg.inv(markers.covariance + 1e-12 * np.eye(3 * len(markers)))
+            prior = np.asarray(np.linalg.inv(markers.covariance + 1e-12 * np.eye(3 * len(markers))))
         self.window = Window(
             camera,
             markers.points.copy(),
@@ -266,6 +266,39 @@ class WristTracker:
         self._frames, self._flags = [self.frame], [(True, ambiguous)]
         return Step(self._newest(t, True, ambiguous), marker + 1, finished, True, pairs)
 
+    def insert(self, blobs: BlobFrame) -> Step | None:
+        """Take a frame that comes late, at its own time; None when it is too old to change anything that is still open."""
+        if not self.tracking:
+            return None
+        place = self.window.place(blobs.t)
+        if place is None:
+            return None
+        self.frame += 1
+        uvz = np.concatenate([blobs.uv, blobs.depth[:, None]], axis=1)
+        covariance = blob_covariances(
+            self.camera,
+            self.noise,
+            blobs.depth,
+            self.usual_depth,
+            blobs.covariance_uv,
+            blobs.covariance_depth,
+        )
+        R, x = self.window.between(blobs.t)
+        # The newest node is the least known of the window: its covariance is on the safe side.
+        predicted = self._prediction(R, x, self.window.covariance_newest)
+        marker = np.full(len(uvz), -1, dtype=np.intp)
+        if predicted.pixel_sd <= self.association.uncertain_px:
+            marker = assign(
+                self.association.method, predicted, uvz, covariance, self.rates, self.association.gate
+            ).marker
+        used = bool(np.any(marker >= 0))
+        self._frames.insert(place, self.frame)
+        self._flags.insert(place, (used, False))
+        pairs = self._pairs(uvz, covariance, marker, R, x)
+        leaving = self.window.insert(blobs.t, pairs)
+        finished = [] if leaving is None else [self._finish(leaving)]
+        return Step(self._newest(self.window.t[-1], *self._flags[-1]), marker + 1, finished, False, pairs)
+
     def flush(self) -> list[tuple[int, Node]]:
         """What is still in the lag, smoothed as far as it will be."""
         return self._drain() if self.tracking else []
@@ -391,6 +424,12 @@ class WristTracker:
     def _newest(self, t: float, used: bool, ambiguous: bool) -> Node:
         s, P = self.window.shared, self.window.covariance_newest
         return Node(t, self.window.R[-1], self.window.x[-1], P[s:, s:], P[s:, :s], False, used, ambiguous)
+
+    def newest_node(self) -> Node:
+        """The newest node as it is now."""
+        if not self.tracking:
+            return self._nothing(self.window.t[-1] if self.window.t else 0.0)
+        return self._newest(self.window.t[-1], *self._flags[-1])
 
     def _nothing(self, t: float) -> Node:
         """A lost hand: the last track moved on, with a covariance that grows; NaN before there was one."""

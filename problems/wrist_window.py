@@ -1,6 +1,6 @@
 """Fixed-lag smoothing of the wrist: Gauss-Newton over the nodes of the last frames, with what is older in a quadratic prior.
 
-The same terms as the whole problem (:mod:`factorgrasp.problems.wrist_model`). Unknowns stand as ``[layout (3n or 0), node 0, node 1, ...]``;
+The same terms as the whole problem (:mod:`factorgrasp.problems.wrist_model`). Unknowns stand as ``[layout (3n or 0), node 0, ...]``;
 a node that leaves is eliminated at its last linearisation, exactly as a graph's fixed-lag smoother does.
 """
 
@@ -47,8 +47,15 @@ class Prior:
 class Leaving:
     """A node as it leaves the window, smoothed by all that followed within the lag.
 
-    `covariance` (D, D) is its own, `with_layout` (D, 3n or 0) that with the layout. `transition_chi2` and `transition_freedom` (2,), for [rotation, translation], say how the step to the next node compares with its
-    assumed variance: squared normalised residual, and the value expected of it.
+    Attributes
+    ----------
+    R, x : ndarray
+    covariance : (D, D) ndarray
+    with_layout : (D, 3n or 0) ndarray
+        Covariance with the layout.
+    transition_chi2, transition_freedom : (2,) ndarray
+        How the step to the next node compares with its assumed variance, for [rotation, translation]: squared normalised residual, and
+        the value expected of it.
     """
 
     R: FloatArray
@@ -123,7 +130,7 @@ class Window:
         self.prior = Prior(R.copy(), x.copy(), kept_mean, information, vector)
         self.t, self.pairs, self._roots = [t], [_no_pairs()], []
         self.R, self.x = R[None].copy(), x[None].copy()
-        self.covariance_newest = np.linalg.inv(information)
+        self.covariance_newest = np.asarray(np.linalg.inv(information))
 
     def _layout_knowledge(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Marginal information, information vector and linearisation point of the layout, from all there is in the window."""
@@ -171,6 +178,32 @@ class Window:
         """Replace the newest frame's pairs and smooth again."""
         self.pairs[-1] = pairs
         self._smooth()
+
+    def place(self, t: float) -> int | None:
+        """Where a late frame belongs: the index of the node after it; None when it is older than the window or has a node's own time."""
+        if not self.t or t <= self.t[0] or t >= self.t[-1] or t in self.t:
+            return None
+        return int(np.searchsorted(self.t, t))
+
+    def between(self, t: float) -> tuple[FloatArray, FloatArray]:
+        """A node between two others, from the one before it."""
+        k = int(np.searchsorted(self.t, t))
+        R, x, _ = transition(self.R[k - 1], self.x[k - 1], t - self.t[k - 1], self.motion)
+        return R, x
+
+    def insert(self, t: float, pairs: Pairs) -> Leaving | None:
+        """Put a late frame between two nodes, smooth, and let the oldest node go when the lag is full."""
+        k = self.place(t)
+        assert k is not None
+        R, x = self.between(t)
+        steps = np.array([t - self.t[k - 1], self.t[k] - t])
+        self._roots[k - 1 : k] = list(motion_root(steps, self.densities, self.motion))
+        self.t.insert(k, t)
+        self.pairs.insert(k, pairs)
+        self.R = np.insert(self.R, k, R, axis=0)
+        self.x = np.insert(self.x, k, x, axis=0)
+        self._smooth()
+        return self._leave() if len(self.t) > self.lag + 1 else None
 
     # ---- linear algebra
 
