@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from factorgrasp.errors import InputError
+from factorgrasp.kinematics.angles import Facing, Hand
 from factorgrasp.lie import quaternion_wxyz_to_matrix
 from factorgrasp.models.camera import Camera
 from factorgrasp.models.markers import PALM_NAMES, MarkerLayout
@@ -62,10 +63,12 @@ def build(table: Mapping[str, Any], base_dir: Path) -> WristTask:
         {key: value for key, value in estimate.items() if key not in ("method", "hand")},
         "[estimate]",
     )
+    facing = get(markers_table, "facing", Literal["back", "palm"], "[markers]", "back")
     layout = read_layout(markers_table, base_dir)
-    blobs, remarks = read_blob_source(blobs_table, base_dir, camera, layout)
+    blobs, remarks = read_blob_source(blobs_table, base_dir, camera)
     if layout is None:
-        layout, more = _layout_from(blobs, camera, markers_table, noise)
+        names = get(markers_table, "names", tuple[str, ...], "[markers]", None)
+        layout, more = _calibrated(blobs, camera, hand, facing, names)
         remarks = (*remarks, *more)
     return WristTask(
         camera,
@@ -77,6 +80,7 @@ def build(table: Mapping[str, Any], base_dir: Path) -> WristTask:
         camera_pose=camera_pose,
         method=method,
         hand=hand,
+        facing=facing,
         remarks=remarks,
     )
 
@@ -135,7 +139,7 @@ def _camera_pose(table: Mapping[str, Any], where: str) -> CameraPose | None:
 def read_layout(table: Mapping[str, Any], base_dir: Path) -> MarkerLayout | None:
     """[markers]: the layout, or None where it has to come out of the recording (``layout = "estimate"``)."""
     where = "[markers]"
-    check_keys(table, ("layout", "names", "sd"), where)
+    check_keys(table, ("layout", "names", "sd", "facing"), where)
     value = table.get("layout")
     if value is None:
         raise InputError(
@@ -221,7 +225,7 @@ def read_layout_json(path: Path) -> MarkerLayout:
 
 
 def read_blob_source(
-    table: Mapping[str, Any], base_dir: Path, camera: Camera, layout: MarkerLayout | None
+    table: Mapping[str, Any], base_dir: Path, camera: Camera
 ) -> tuple[BlobRecording, tuple[str, ...]]:
     """[blobs]: from a table, or detected in images; with what a user should know about them."""
     where = "[blobs]"
@@ -231,7 +235,8 @@ def read_blob_source(
     if sources[0] != "file":
         from factorgrasp.wrist_images import detect_blobs
 
-        return detect_blobs(table, base_dir, camera, layout)
+        blobs, remarks = detect_blobs(table, base_dir, camera)
+        return blobs, (*remarks, *blob_remarks(blobs, camera))
     check_keys(table, ("file",), where)
     blobs = read_blobs(base_dir / get(table, "file", str, where), camera)
     return blobs, blob_remarks(blobs, camera)
@@ -259,11 +264,20 @@ def blob_remarks(blobs: BlobRecording, camera: Camera) -> tuple[str, ...]:
     return tuple(out)
 
 
-def _layout_from(
-    blobs: BlobRecording, camera: Camera, table: Mapping[str, Any], noise: WristNoise
+def _calibrated(
+    blobs: BlobRecording, camera: Camera, hand: Hand, facing: Facing, names: tuple[str, ...] | None
 ) -> tuple[MarkerLayout, tuple[str, ...]]:
-    """The layout of ``layout = "estimate"``: from the first frames' points with depth."""
-    raise NotImplementedError
+    """The layout of ``layout = "estimate"``: from the first frames that show all markers with depth."""
+    from factorgrasp.palm_calibration import calibrate_palm
+
+    found = calibrate_palm(blobs, camera, hand, facing)
+    layout = found.layout
+    if names is not None:
+        if len(names) != len(layout):
+            raise InputError("[markers] names", f"{len(layout)} names, one a marker", f"{len(names)}")
+        layout = MarkerLayout(names, layout.points, layout.covariance)
+    sd = 1e3 * float(np.sqrt(np.mean(layout.sd**2)))
+    return layout, (f"the layout was calibrated from {found.frames.size} frames, to {sd:.2f} mm a coordinate",)
 
 
 def _association(table: Mapping[str, Any]) -> WristAssociation:

@@ -11,6 +11,7 @@ from factorgrasp.kinematics.angles import (
     AXES,
     ISB_NAMES,
     OPPOSITES,
+    Facing,
     Hand,
     angle_covariance,
     isb_signs,
@@ -70,7 +71,11 @@ class WristMeasures:
 
 
 def wrist_measures(
-    track: WristTrack, hand: Hand = "right", samples: int = SAMPLES, seed: int = 0
+    track: WristTrack,
+    hand: Hand = "right",
+    facing: Facing = "back",
+    samples: int = SAMPLES,
+    seed: int = 0,
 ) -> WristMeasures:
     """Measures of a track; smoothed ones only, for a filter's noise makes ranges of motion 2 to 3 degrees too large.
 
@@ -79,6 +84,8 @@ def wrist_measures(
     track : WristTrack
     hand : {"right", "left"}
         Decides the signs of deviation and pronation.
+    facing : {"back", "palm"}
+        The side of the hand out of which z of ``W`` points.
     samples : int
         Tracks that are drawn for the standard deviations.
     seed : int
@@ -92,7 +99,7 @@ def wrist_measures(
         np.where(track.lost[:, None], np.nan, values)
         for values in (track.position, track.velocity, track.angular_velocity)
     )
-    signs = isb_signs(hand)
+    signs = isb_signs(hand, facing)
     angles = signs * wrist_angles(R)
     variance = np.einsum("nii->ni", angle_covariance(R, P[:, :3, :3]))
     sd = np.sqrt(np.maximum(variance, 0.0))
