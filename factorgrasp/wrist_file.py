@@ -257,6 +257,11 @@ def blob_remarks(blobs: BlobRecording, camera: Camera) -> tuple[str, ...]:
     elif known.mean() < 0.5:
         out.append(f"only {100.0 * known.mean():.0f} % of the blobs have a depth")
     step = float(np.median(np.diff(blobs.t))) if len(blobs) > 1 else float("nan")
+    if np.isfinite(step) and not 0.02 < step * camera.rate < 50.0:
+        raise InputError(
+            f"{blobs.name}: t", f"seconds, about {1.0 / camera.rate:.3g} from frame to frame", f"steps of {step:.4g}",
+            "Milliseconds? Name the column 't [ms]'" if step * camera.rate > 1.0 else "",
+        )  # fmt: skip
     if np.isfinite(step) and not 0.5 < step * camera.rate < 2.0:
         out.append(
             f"frames come every {1e3 * step:.3g} ms, and [camera] rate says {1e3 / camera.rate:.3g} ms: is the column t in seconds?"
@@ -277,7 +282,9 @@ def _calibrated(
             raise InputError("[markers] names", f"{len(layout)} names, one a marker", f"{len(names)}")
         layout = MarkerLayout(names, layout.points, layout.covariance)
     sd = 1e3 * float(np.sqrt(np.mean(layout.sd**2)))
-    return layout, (f"the layout was calibrated from {found.frames.size} frames, to {sd:.2f} mm a coordinate",)
+    return layout, (
+        f"the layout was calibrated from {found.frames.size} frames, to {sd:.2f} mm a coordinate",
+    )
 
 
 def _association(table: Mapping[str, Any]) -> WristAssociation:

@@ -56,11 +56,11 @@ def detect_blobs(
     paths = {
         key: base_dir / get(table, key, str, where) for key in ("video", "images", "depth") if key in table
     }
-    source = read_frames(
-        **paths,
-        depth_scale=get(table, "depth_scale", float, where, 1e-3),
-        rate=get(table, "rate", float, where, None),
-    )
+    scale, rate = get(table, "depth_scale", float, where, 1e-3), get(table, "rate", float, where, None)
+    try:
+        source = read_frames(**paths, depth_scale=scale, rate=rate)
+    except InputError as error:
+        raise InputError(place(where, error.field), error.expected, error.found, error.hint) from error
     number = get(table, "reference_frame", int, where, 0)
     if not 0 <= number < len(source):
         raise InputError(

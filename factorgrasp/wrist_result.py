@@ -206,7 +206,8 @@ class WristResult:
         ]
         if self.message:
             lines.append(self.message)
-        for one in self.measures.range_of_motion:
+        # What an answer that is none says of the hand is not for printing.
+        for one in self.measures.range_of_motion if self.status.ok else ():
             (up, most), (down, least) = zip(
                 one.directions, (one.maximum.value, -one.minimum.value), strict=True
             )
@@ -218,7 +219,7 @@ class WristResult:
                 f"  {axis:<24}{np.degrees(one.range.value):6.1f} deg +- {np.degrees(one.range.sd):.1f}   ({up.replace('_', ' ')} "
                 f"{np.degrees(most):.1f}, {down.replace('_', ' ')} {np.degrees(least):.1f}; {one.cycles} {cycles})"
             )
-        for move in self.measures.movements:
+        for move in self.measures.movements if self.status.ok else ():
             way = f"{quantity(move.distance.value, 'm', 3)} +- {quantity(move.distance.sd, 'm')}"
             lines.append(
                 f"  movement {move.start:6.2f} to {move.end:.2f} s: {way}, peak {significant(move.peak_speed.value, 3)} m/s, "

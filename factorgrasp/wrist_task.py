@@ -29,12 +29,15 @@ from factorgrasp.provenance import versions
 from factorgrasp.recordings.blobs import BlobRecording
 from factorgrasp.status import Status
 from factorgrasp.typing import FloatArray, State
+from factorgrasp.wrist_checks import riding_blobs, riding_words, seen_from_behind
 from factorgrasp.wrist_result import WristResult
 
 MOST_AMBIGUOUS = 0.2
 """Share of the frames that may be ambiguous before the answer as a whole is."""
 LEAST_FOUND = 0.5
 """Share of the frames in which the hand has to be found."""
+LEAST_DETECTION = 0.6
+"""Share of the markers that have to be seen for an answer about which there are doubts."""
 
 
 class WristTask:
@@ -100,8 +103,11 @@ class WristTask:
         except NotSolvedError as error:
             solved = self._nothing(str(error))
         measures = wrist_measures(solved.track, self.hand, self.facing)
-        warnings = [*self.remarks, *solved.warnings, *seen_from_behind(solved.track), *measures.words]
-        status, message = self._judged(solved)
+        track = solved.track
+        riding = riding_blobs(track, self.problem.blobs, self.problem.camera)
+        doubts = (*seen_from_behind(track), *riding_words(riding))
+        status, message = self._judged(solved, doubts)
+        warnings = [*self.remarks, *solved.warnings, *doubts, *measures.words]
         estimate = replace(solved.estimate, status=status, message=message)
         return WristResult(
             estimate,
@@ -208,7 +214,7 @@ class WristTask:
         clutter = problem.blobs.frame.size / max(n, 1)
         return WristPoseEstimate(estimate, track, 0.0, clutter, nan, nan, nan, nan, nan, nan)
 
-    def _judged(self, solved: WristPoseEstimate) -> tuple[Status, str]:
+    def _judged(self, solved: WristPoseEstimate, doubts: tuple[str, ...]) -> tuple[Status, str]:
         """Whether the track as a whole answers the question."""
         status, message = solved.estimate.status, solved.estimate.message
         track = solved.track
@@ -226,18 +232,9 @@ class WristTask:
                 f"the hand was found in {100.0 * found:.0f} % of the frames only; check the layout, the units of the depth and the "
                 "intrinsics"
             )
+        if doubts and solved.detection < LEAST_DETECTION:
+            return Status.INFEASIBLE, (
+                f"no motion of this layout explains the blobs: only {100.0 * solved.detection:.0f} % of its markers are seen, and "
+                f"{doubts[-1]} Are the intrinsics right?"
+            )
         return status, message
-
-
-def seen_from_behind(track: WristTrack) -> tuple[str, ...]:
-    """A word when the markers are on the far side of the hand, which no camera can see."""
-    seen = ~track.lost
-    if not seen.any():
-        return ()
-    towards = np.einsum("ni,ni->n", track.camera_rotation[seen][:, :, 2], track.camera_position[seen])
-    if np.mean(towards > 0.0) < 0.5:
-        return ()
-    return (
-        "the markers are on the side of the hand that the camera cannot see: are the columns u and v swapped, or is the layout that of "
-        "the other hand, or its z axis not out of the back of the hand?",
-    )
