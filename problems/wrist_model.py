@@ -142,7 +142,10 @@ def predict(
     J_point = whole @ R
     J_pose = np.empty((seen.shape[0], 3, 6))
     # d(R Exp(d) m) = -R [m]x d: the columns of J_point crossed with m.
-    J_pose[:, :, :3] = np.cross(points[:, None, :], J_point)
+    m = points[:, :, None]
+    J_pose[:, :, 0] = m[:, 1] * J_point[:, :, 2] - m[:, 2] * J_point[:, :, 1]
+    J_pose[:, :, 1] = m[:, 2] * J_point[:, :, 0] - m[:, 0] * J_point[:, :, 2]
+    J_pose[:, :, 2] = m[:, 0] * J_point[:, :, 1] - m[:, 1] * J_point[:, :, 0]
     J_pose[:, :, 3:] = whole
     return np.concatenate([uv, seen[:, 2:]], axis=1), J_pose, J_point
 
@@ -209,8 +212,9 @@ def motion_rows(
     second = np.zeros((count, size, size))
     axes = np.arange(size)
     first[:, axes, axes], second[:, axes, axes] = -1.0, 1.0
-    first[:, :3, :3] = -lie.so3_left_jacobian_inverse(phi)
-    second[:, :3, :3] = lie.so3_right_jacobian_inverse(phi)
+    right = lie.so3_right_jacobian_inverse(phi)
+    # The inverse left Jacobian is the transpose of the right one.
+    first[:, :3, :3], second[:, :3, :3] = -np.swapaxes(right, 1, 2), right
     low = np.arange(size - 6)
     first[:, low, low + 6] = -h
     if motion == "jerk":

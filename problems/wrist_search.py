@@ -101,7 +101,7 @@ def search(
             break
         if any(_same(f, R[k], p[k], 0.15, 0.02) for f in found):
             continue
-        better = _judge(camera, points, layout_blocks, R[k], p[k], uvz, covariance, rates, gate, guess)
+        better = judge(camera, points, layout_blocks, R[k], p[k], uvz, covariance, rates, gate, guess)
         if better is not None:
             found.append(better)
     found.sort(key=lambda f: -f.assignment.score)
@@ -177,7 +177,7 @@ def _rank(
     return np.argsort(-np.sum(np.maximum(1.0 - nearest / 9.0, 0.0), axis=1), kind="stable")
 
 
-def _judge(
+def judge(
     camera: Camera,
     points: FloatArray,
     layout_blocks: FloatArray,
@@ -188,9 +188,11 @@ def _judge(
     rates: Rates,
     gate: float,
     guess: Guess | None,
+    loose: FloatArray | None = None,
 ) -> Found | None:
     """Fit a pose to the blobs that are jointly compatible with it, and say how probable they are."""
-    loose = np.diag(np.array([0.12, 0.12, 0.12, 0.01, 0.01, 0.01]) ** 2)
+    if loose is None:
+        loose = np.diag(np.array([0.12, 0.12, 0.12, 0.01, 0.01, 0.01]) ** 2)
     assignment = None
     for _ in range(2):
         predicted = prediction(camera, points, layout_blocks, R, p, loose)

@@ -9,10 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from factorgrasp import lie
 from factorgrasp.models.camera import Camera
 from factorgrasp.models.markers import MarkerLayout
 from factorgrasp.problems.wrist_assign import Prediction, Rates, assign
-from factorgrasp.problems.wrist_flat import flat_search
+from factorgrasp.problems.wrist_flat import DECIDED, DEEP_ENOUGH, LOOSE, flat_search, second_pose
 from factorgrasp.problems.wrist_model import NODE_SIZE, Pairs, blob_covariances, predict, roots
 from factorgrasp.problems.wrist_search import Found, Guess, prediction, search
 from factorgrasp.problems.wrist_settings import WristAssociation, WristNoise, WristSettings
@@ -122,7 +123,7 @@ class WristTracker:
         )
         self._blocks = markers.blocks if settings.layout != "exact" else np.zeros((len(markers), 3, 3))
         self._frames: list[int] = []
-        self._flags: list[tuple[bool, bool]] = []
+        self._flags: list[tuple[bool, FloatArray | None]] = []
         self.frame = -1
         self.found = False
         self.tracking = False
@@ -134,6 +135,9 @@ class WristTracker:
         self._fit = np.zeros((2, 2))
         self._poor = 0
         self._shallow = 0
+        self._last_doubt: FloatArray | None = None
+        self._against = 0
+        self._handed_over: list[tuple[int, Node]] = []
 
     # ---- what is known
 
@@ -218,9 +222,8 @@ class WristTracker:
             if found is not None:
                 marker, R, x = found.assignment.marker, found.R, np.concatenate([found.p, x[3:]])
         used = bool(np.any(marker >= 0))
-        ambiguous = self._doubt(R, x, uvz, covariance, marker)
         self._frames.append(self.frame)
-        self._flags.append((used, ambiguous))
+        self._flags.append((used, None))
         pairs = self._pairs(uvz, covariance, marker, R, x)
         try:
             leaving = self.window.push(t, pairs, R, x)
@@ -234,7 +237,13 @@ class WristTracker:
         if used:
             self.last_used = t
         self._count(marker, predicted)
-        newest = self._newest(t, used, ambiguous)
+        doubt = self._doubt(self.window.R[-1], self.window.x[-1, :3], uvz, covariance, marker)
+        self._flags[-1] = used, doubt
+        if self._against >= 3 and doubt is not None:
+            self._turn_over(doubt)
+        newest = self._newest(t, used, doubt)
+        finished += self._handed_over
+        self._handed_over = []
         return Step(newest, marker + 1, finished, searched, pairs)
 
     def _seek(
@@ -262,9 +271,9 @@ class WristTracker:
         self.window.refresh(pairs)
         self.tracking = self.found = True
         self.last_used, self._poor = t, 0
-        ambiguous = self._doubt(found.R, x, uvz, covariance, marker)
-        self._frames, self._flags = [self.frame], [(True, ambiguous)]
-        return Step(self._newest(t, True, ambiguous), marker + 1, finished, True, pairs)
+        doubt = self._doubt(self.window.R[-1], self.window.x[-1, :3], uvz, covariance, marker)
+        self._frames, self._flags = [self.frame], [(True, doubt)]
+        return Step(self._newest(t, True, doubt), marker + 1, finished, True, pairs)
 
     def insert(self, blobs: BlobFrame) -> Step | None:
         """Take a frame that comes late, at its own time; None when it is too old to change anything that is still open."""
@@ -293,7 +302,7 @@ class WristTracker:
             ).marker
         used = bool(np.any(marker >= 0))
         self._frames.insert(place, self.frame)
-        self._flags.insert(place, (used, False))
+        self._flags.insert(place, (used, self._last_doubt))
         pairs = self._pairs(uvz, covariance, marker, R, x)
         leaving = self.window.insert(blobs.t, pairs)
         finished = [] if leaving is None else [self._finish(leaving)]
@@ -367,10 +376,9 @@ class WristTracker:
             # Without any depth for a while: the hand is taken to lie as the paper asks, its back towards the camera.
             self._shallow += 1
             if self._shallow > 2:
-                flat = flat_search(
+                return flat_search(
                     self.camera, self.window.layout, self._blocks, uvz, covariance, self.rates, gate
                 )
-                return None if flat is None else flat.found
         return None
 
     def _elsewhere(self, marker: IntArray, uvz: FloatArray, covariance: FloatArray) -> Found | None:
@@ -386,14 +394,30 @@ class WristTracker:
         return found
 
     def _doubt(
-        self, R: FloatArray, x: FloatArray, uvz: FloatArray, covariance: FloatArray, marker: IntArray
-    ) -> bool:
-        """Whether the frame's pixels allow a second pose because there is (almost) no depth."""
+        self, R: FloatArray, p: FloatArray, uvz: FloatArray, covariance: FloatArray, marker: IntArray
+    ) -> FloatArray | None:
+        """How far away (6,) the pose may be because there is (almost) no depth; None when the pixels leave no doubt."""
         used = marker >= 0
-        if not used.any() or np.count_nonzero(np.isfinite(uvz[used, 2])) >= 3:
-            self._shallow = 0
-            return False
-        return False
+        if not used.any():
+            return self._last_doubt
+        if np.count_nonzero(np.isfinite(uvz[used, 2])) >= DEEP_ENOUGH:
+            self._last_doubt, self._against = None, 0
+            return None
+        if np.isfinite(uvz[:, 2]).any() and self._last_doubt is None:
+            # A camera with depth whose few markers lack it just now: the track remembers which of the two poses it was.
+            return None
+        other = second_pose(self.camera, self.window.layout, self._blocks, R, p, uvz, covariance, marker)
+        s = self.window.shared
+        P = self.window.covariance_newest[s : s + 3, s : s + 3]
+        loose = float(np.sqrt(np.linalg.eigvalsh(P)[-1])) > LOOSE
+        if other is not None and other[1] < DECIDED:
+            self._last_doubt = other[0]
+            self._against = self._against + 1 if other[1] < -DECIDED else 0
+        elif loose or np.count_nonzero(used) < 4:
+            self._last_doubt = np.zeros(6) if self._last_doubt is None else self._last_doubt
+        else:
+            self._last_doubt, self._against = None, 0
+        return self._last_doubt
 
     def _count(self, marker: IntArray, predicted: Prediction) -> None:
         if not self.association.adapt or predicted.pixel_sd > self.association.uncertain_px:
@@ -421,9 +445,19 @@ class WristTracker:
 
     # ---- results
 
-    def _newest(self, t: float, used: bool, ambiguous: bool) -> Node:
+    def _turn_over(self, doubt: FloatArray) -> None:
+        """The pixels of several frames speak for the other pose: go on from there."""
+        R, p = self.window.R[-1] @ lie.so3_exp(doubt[:3]), self.window.x[-1, :3] + doubt[3:]
+        pairs, t = self.window.pairs[-1], self.window.t[-1]
+        self._handed_over += self._drain_but_newest()
+        self.window.start(t, R, p, POSE_SD, RATE_SD)
+        self.window.refresh(pairs)
+        self._frames, self._flags = [self.frame], [(True, doubt)]
+        self._against = 0
+
+    def _newest(self, t: float, used: bool, doubt: FloatArray | None) -> Node:
         s, P = self.window.shared, self.window.covariance_newest
-        return Node(t, self.window.R[-1], self.window.x[-1], P[s:, s:], P[s:, :s], False, used, ambiguous)
+        return _node(t, self.window.R[-1], self.window.x[-1], P[s:, s:], P[s:, :s], used, doubt)
 
     def newest_node(self) -> Node:
         """The newest node as it is now."""
@@ -451,32 +485,33 @@ class WristTracker:
         return Node(t, R, x, P[s:, s:], P[s:, :s], True, False, False)
 
     def _finish(self, leaving: Leaving) -> tuple[int, Node]:
-        t = self._leaving_time
-        used, ambiguous = self._flags.pop(0)
-        node = Node(t, leaving.R, leaving.x, leaving.covariance, leaving.with_layout, False, used, ambiguous)
-        return self._frames.pop(0), node
-
-    @property
-    def _leaving_time(self) -> float:
-        return self.window.left
+        used, doubt = self._flags.pop(0)
+        parts = leaving.R, leaving.x, leaving.covariance, leaving.with_layout
+        return self._frames.pop(0), _node(self.window.left, *parts, used, doubt)
 
     def _drain(self) -> list[tuple[int, Node]]:
         out = []
         for t, leaving in zip(self.window.t, self.window.drain(), strict=True):
-            used, ambiguous = self._flags.pop(0)
-            out.append(
-                (
-                    self._frames.pop(0),
-                    Node(
-                        t,
-                        leaving.R,
-                        leaving.x,
-                        leaving.covariance,
-                        leaving.with_layout,
-                        False,
-                        used,
-                        ambiguous,
-                    ),
-                )
-            )
+            used, doubt = self._flags.pop(0)
+            parts = leaving.R, leaving.x, leaving.covariance, leaving.with_layout
+            out.append((self._frames.pop(0), _node(t, *parts, used, doubt)))
         return out
+
+    def _drain_but_newest(self) -> list[tuple[int, Node]]:
+        return self._drain()[:-1]
+
+
+def _node(
+    t: float,
+    R: FloatArray,
+    x: FloatArray,
+    covariance: FloatArray,
+    with_layout: FloatArray,
+    used: bool,
+    doubt: FloatArray | None,
+) -> Node:
+    """A node; its covariance covers a second pose where there is one."""
+    if doubt is not None:
+        covariance = covariance.copy()
+        covariance[:6, :6] += 0.5 * np.outer(doubt, doubt)
+    return Node(t, R, x, covariance, with_layout, False, used, doubt is not None)

@@ -24,7 +24,7 @@ from factorgrasp.problems.wrist_model import (
     transition,
 )
 from factorgrasp.problems.wrist_settings import Motion
-from factorgrasp.typing import FloatArray
+from factorgrasp.typing import FloatArray, IntArray
 
 _SMALL_STEP = 0.6
 """Length of the step of all unknowns together, in standard deviations, after which no other is made: steps shrink by
@@ -108,6 +108,7 @@ class Window:
         self.covariance_newest: FloatArray = np.empty((0, 0))
         self.weights: FloatArray = np.empty(0)
         self.left = float("nan")
+        self._joined: tuple[IntArray, Pairs | None, IntArray]
 
     def __len__(self) -> int:
         return len(self.t)
@@ -138,6 +139,7 @@ class Window:
             return np.zeros((0, 0)), np.zeros(0), self.layout.copy()
         if self.prior is None:
             return self._layout_information, np.zeros(self.shared), self._layout_mean
+        self._join()
         H, g = self._normal_equations()
         k = self.shared
         gain = np.linalg.solve(H[k:, k:], np.concatenate([H[k:, :k], g[k:, None]], axis=1))
@@ -226,8 +228,10 @@ class Window:
         away = np.concatenate([(self.layout - prior.layout).ravel()[:s], phi, self.x[0] - prior.x])
         J = np.eye(s + D)
         J[s : s + 3, s : s + 3] = lie.so3_right_jacobian_inverse(phi)
-        H[: s + D, : s + D] += J.T @ prior.information @ J
-        g[: s + D] += J.T @ (prior.vector - prior.information @ away)
+        matrix, vector = J.T @ prior.information @ J, J.T @ (prior.vector - prior.information @ away)
+        H[: s + D, : s + D] += matrix
+        g[: s + D] += vector
+        self._first_prior = matrix, vector
 
     def _add_motion(self, H: FloatArray, g: FloatArray) -> None:
         D, s = self.size, self.shared
@@ -238,18 +242,18 @@ class Window:
         r = (root @ residual[:, :, None])[:, :, 0]
         gram = np.swapaxes(J, 1, 2) @ J
         right = (np.swapaxes(J, 1, 2) @ r[:, :, None])[:, :, 0]
+        self._first_motion = J[0], r[0]
         for k in range(dt.size):
             a = s + k * D
             H[a : a + 2 * D, a : a + 2 * D] += gram[k]
             g[a : a + 2 * D] -= right[k]
 
     def _add_markers(self, H: FloatArray, g: FloatArray) -> None:
-        counts = np.array([len(p) for p in self.pairs])
-        if not counts.any():
+        counts, pairs, node = self._joined
+        self._first_markers = np.zeros((0, self.shared + 7))
+        if pairs is None:
             self.weights = np.empty(0)
             return
-        pairs = Pairs.join([p for p in self.pairs if len(p)])
-        node = np.repeat(np.arange(counts.size), counts)
         r, J_pose, J_point = self._marker_rows(pairs, node)
         self.weights = self._weights(r)
         scale = np.sqrt(self.weights)
@@ -262,6 +266,8 @@ class Window:
         A[rows, :, s + 6 * node[:, None] + six] = np.swapaxes(J_pose * scale[:, None, None], 1, 2)
         A[:, :, -1] = r * scale[:, None]
         flat = A.reshape(3 * M, -1)
+        own = np.concatenate([np.arange(s + 6), [A.shape[2] - 1]])
+        self._first_markers = flat[: 3 * counts[0], own]
         gram = flat.T @ flat
         columns = np.concatenate([np.arange(s), (s + D * np.arange(counts.size)[:, None] + six).ravel()])
         H[columns[:, None], columns] += gram[:-1, :-1]
@@ -278,8 +284,20 @@ class Window:
         c2 = self.loss_scale**2
         return np.asarray((c2 / (c2 + np.einsum("mi,mi->m", r, r))) ** 2)
 
+    def _join(self) -> None:
+        """All pairs of the window as one, once a frame."""
+        counts = np.array([len(p) for p in self.pairs])
+        filled = [p for p in self.pairs if len(p)]
+        self._joined = (
+            counts,
+            Pairs.join(filled) if filled else None,
+            np.repeat(np.arange(counts.size), counts),
+        )
+
     def _smooth(self) -> None:
+        self._join()
         for _ in range(_MOST_STEPS):
+            self._at = self.R, self.x, self.layout
             H, g = self._normal_equations()
             factor, info = lapack.dpotrf(H, lower=1, clean=1, overwrite_a=1)
             if info != 0:
@@ -328,41 +346,39 @@ class Window:
         return out
 
     def _transition_fit(self, P: FloatArray) -> tuple[FloatArray, FloatArray]:
-        residual, first, second = motion_rows(
-            self.R[:2], self.x[:2], np.array([self.t[1] - self.t[0]]), self.motion
-        )
-        root = self._roots[0]
-        r = root @ residual[0]
-        J = root @ np.concatenate([first[0], second[0]], axis=1)
-        spread = np.einsum("ij,jk,ik->i", J, P, J)
+        J, r = self._first_motion
+        spread = np.einsum("ij,ij->i", J @ P, J)
         part = (np.arange(self.size) // 3) % 2
         chi2 = np.array([np.sum(r[part == i] ** 2) for i in (0, 1)])
         return chi2, np.array([np.sum(1.0 - spread[part == i]) for i in (0, 1)])
 
     def _marginalise(self) -> None:
-        """Eliminate node 0 from its prior, its markers and its motion to node 1."""
+        """Eliminate node 0 from its prior, its markers and its motion to node 1, as they were linearised last."""
         s, D = self.shared, self.size
-        keep = (self.t, self.pairs, self._roots, self.R, self.x)
-        self.t, self.pairs, self._roots = self.t[:2], [self.pairs[0], _no_pairs()], self._roots[:1]
-        self.R, self.x = self.R[:2], self.x[:2]
-        H, g = self._normal_equations()
-        self.t, self.pairs, self._roots, self.R, self.x = keep
+        H, g = np.zeros((s + 2 * D, s + 2 * D)), np.zeros(s + 2 * D)
+        matrix, vector = self._first_prior
+        H[: s + D, : s + D] += matrix
+        g[: s + D] += vector
+        J, r = self._first_motion
+        H[s:, s:] += J.T @ J
+        g[s:] -= J.T @ r
+        A = self._first_markers
+        H[: s + 6, : s + 6] += A[:, :-1].T @ A[:, :-1]
+        g[: s + 6] -= A[:, :-1].T @ A[:, -1]
         old = np.arange(s, s + D)
         new = np.concatenate([np.arange(s), np.arange(s + D, s + 2 * D)])
         factor = lapack.dpotrf(H[np.ix_(old, old)], lower=1, clean=1)[0]
-        half, _ = lapack.dtrtrs(factor, np.concatenate([H[np.ix_(old, new)], g[old, None]], axis=1), lower=1)
+        columns = np.concatenate([H[np.ix_(old, new)], g[old, None]], axis=1)
+        half, _ = lapack.dtrtrs(factor, columns, lower=1)
         information = H[np.ix_(new, new)] - half[:, :-1].T @ half[:, :-1]
         vector = g[new] - half[:, :-1].T @ half[:, -1]
+        R, x, layout = self._at
+        self.prior = Prior(
+            R[1].copy(), x[1].copy(), layout.copy(), 0.5 * (information + information.T), vector
+        )
         self.left = self.t[0]
         self.t, self.pairs, self._roots = self.t[1:], self.pairs[1:], self._roots[1:]
         self.R, self.x = self.R[1:], self.x[1:]
-        self.prior = Prior(
-            self.R[0].copy(),
-            self.x[0].copy(),
-            self.layout.copy(),
-            0.5 * (information + information.T),
-            vector,
-        )
 
 
 def _no_pairs() -> Pairs:
