@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -10,9 +11,10 @@ import numpy as np
 from factorgrasp.errors import InputError, NotSolvedError
 from factorgrasp.losses import make_loss
 from factorgrasp.models.camera import Camera
+from factorgrasp.models.marker_files import write_layout
 from factorgrasp.models.markers import MarkerLayout
 from factorgrasp.problems.palm_labels import MOST_POINTS, Labelling, label_points
-from factorgrasp.problems.palm_layout import PalmConvention, PalmLayout, PalmView, palm_frame
+from factorgrasp.problems.palm_layout import PalmConvention, PalmLayout, PalmView, in_palm_frame, palm_frame
 from factorgrasp.recordings.blobs import BlobFrame, BlobRecording
 from factorgrasp.solvers.solve import solve
 from factorgrasp.typing import FloatArray, IntArray
@@ -60,6 +62,12 @@ class PalmCalibration:
     consistency: float
     scale: float
 
+    def save(self, path: str | Path) -> Path:
+        """Write the layout as JSON, to be used again: :func:`factorgrasp.models.marker_files.read_layout`."""
+        return write_layout(
+            path, self.layout, frames=self.frames.tolist(), consistency=self.consistency, scale=self.scale
+        )
+
 
 def calibrate_palm(
     blobs: BlobRecording,
@@ -69,7 +77,7 @@ def calibrate_palm(
     template: MarkerLayout | None = None,
     frames: int = 30,
     look: int = 300,
-    systematic_sd: float = 3e-4,
+    systematic_sd: float = 1e-4,
 ) -> PalmCalibration:
     """The layout from the first frames in which all markers are seen with depth.
 
@@ -138,8 +146,6 @@ def calibrate_palm(
 
 def _moved(layout: MarkerLayout) -> FloatArray:
     """Covariance (3n, 3n) in the palm frame of coordinates that each had variance 1: the frame moves with its markers."""
-    from factorgrasp.problems.palm_layout import in_palm_frame
-
     return in_palm_frame(MarkerLayout(layout.names, layout.points, np.eye(3 * len(layout)))).covariance
 
 

@@ -86,6 +86,27 @@ class ColourReference:
         """The marker's histogram, smoothed."""
         return smooth(self.marker, WIDTH)
 
+    @property
+    def background_mean(self) -> FloatArray:
+        """Mean (2,) colour of the background."""
+        axis = (np.arange(BINS) + 0.5) * 2.0 * SPAN / BINS - SPAN
+        return np.array([axis @ self.background.sum(axis=1), axis @ self.background.sum(axis=0)])
+
+    def shifted(self, shift: FloatArray) -> ColourReference:
+        """The same colours under a lamp that shifts x and y by `shift` (2,)."""
+        cells = np.asarray(shift) * BINS / (2.0 * SPAN)
+
+        def moved(counts: FloatArray) -> FloatArray:
+            return np.asarray(np.maximum(ndimage.shift(counts, cells, order=1), 0.0))
+
+        return ColourReference(
+            moved(self.marker),
+            moved(self.background),
+            self.marker_mean + shift,
+            self.pixels,
+            moved(self.mixtures),
+        )
+
     def similarity(self, x: ArrayLike, y: ArrayLike) -> float:
         """Bhattacharyya coefficient (0 to 1) of the pixels' histogram with that of the markers or of their edges, all smoothed."""
         cell = [

@@ -25,6 +25,7 @@ from factorgrasp.vision.images import (
     metres,
 )
 from factorgrasp.vision.images import middle as median
+from factorgrasp.vision.light import NOTICEABLE, light_shift, mean_chroma
 from factorgrasp.vision.opencv import load_cv2
 from factorgrasp.vision.outline_fit import FittedCentre, fit_outline, outline_rms, split_blob
 from factorgrasp.vision.settings import DetectorSettings
@@ -34,7 +35,12 @@ from factorgrasp.vision.table_plane import TablePlane, fit_table
 Kind = Literal["whole", "hidden", "split"]
 
 _MARGIN = 8
-_MOST_COMPONENTS = 80
+_MOST_COMPONENTS = 200
+_MOST_EXAMINED = 40
+_MOST_FUZZY = 3.5
+"""Size of a component relative to its sure inside from which only the inside is taken."""
+_FEW = 6
+"""Blobs: with fewer, another lamp is considered."""
 _SEVERAL = 24
 """px: a component of that size may be several markers."""
 _UNKNOWN_DEPTH_VARIANCE = 1.0
@@ -97,8 +103,31 @@ class _Candidate:
     depth_variance: float
 
 
+_Component = tuple[int, tuple[int, int, int, int, int]]
+"""Label, and (left, top, width, height, area)."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """A reference colour as a table of seeds by :func:`chroma_index`: 1 perhaps the edge of a marker, 2 surely inside of one."""
+
+    reference: ColourReference
+    seeds: Any
+
+    @classmethod
+    def of(cls, reference: ColourReference, threshold: float) -> _Look:
+        found = (reference.table >= threshold).astype(np.uint8)
+        found += (reference.strict_table >= threshold).astype(np.uint8)
+        seeds = np.zeros(1 << 16, dtype=np.uint8)
+        seeds[: found.size] = found.ravel()
+        return cls(reference, seeds)
+
+
 class BlobDetector:
     """Finds markers of one colour.
+
+    It remembers one thing from image to image: the lamp. When fewer than six blobs are found and the colours of the whole image have shifted as
+    another lamp shifts them, the reference is shifted likewise and, if that finds more, kept so.
 
     Parameters
     ----------
@@ -119,11 +148,8 @@ class BlobDetector:
         self.settings = settings or DetectorSettings()
         self.camera = camera
         self._kernels: tuple[Any, ...] = ()
-        # 1: perhaps the edge of a marker; 2: surely inside of one.
-        seeds = (reference.table >= self.settings.threshold).astype(np.uint8)
-        seeds += (reference.strict_table >= self.settings.threshold).astype(np.uint8)
-        self._seeds = np.zeros(1 << 16, dtype=np.uint8)
-        self._seeds[: seeds.size] = seeds.ravel()
+        self._looks = {(0.0, 0.0): _Look.of(reference, self.settings.threshold)}
+        self._look = (0.0, 0.0)
 
     def detect(self, rgb: ArrayLike, depth: ArrayLike | None = None) -> DetectedBlobs:
         """The blobs of an image.
@@ -157,9 +183,34 @@ class BlobDetector:
         table = None
         if z is not None and self.settings.region in ("auto", "depth"):
             table = fit_table(z)
-        seeds = self._seeds.take(chroma_index(image, cv2))
+        index = chroma_index(image, cv2)
+        blobs = self._detect(image, z, table, index, self._looks[self._look], cv2)
+        if len(blobs) < _FEW:
+            blobs = self._try_other_light(blobs, image, z, table, index, cv2)
+        return blobs
+
+    def _try_other_light(
+        self, blobs: DetectedBlobs, image: ByteImage, z: Any, table: TablePlane | None, index: Any, cv2: Any
+    ) -> DetectedBlobs:
+        """More blobs, if the image looks as if the lamp had changed and the reference, shifted accordingly, finds more."""
+        shift = light_shift(mean_chroma(image) - self.reference.background_mean)
+        name = (round(float(shift[0]), 1), round(float(shift[1]), 1))
+        if np.hypot(name[0] - self._look[0], name[1] - self._look[1]) < NOTICEABLE:
+            return blobs
+        if name not in self._looks:
+            self._looks[name] = _Look.of(self.reference.shifted(np.array(name)), self.settings.threshold)
+        other = self._detect(image, z, table, index, self._looks[name], cv2)
+        if len(other) < max(3, len(blobs) + 1):
+            return blobs
+        self._look = name
+        return other
+
+    def _detect(
+        self, image: ByteImage, z: Any, table: TablePlane | None, index: Any, look: _Look, cv2: Any
+    ) -> DetectedBlobs:
+        seeds = look.seeds.take(index)
         rejected: Counter[str] = Counter()
-        candidates = self._candidates(image, z, table, seeds, rejected, cv2)
+        candidates = self._candidates(image, z, table, seeds, look.reference, rejected, cv2)
         return self._finish(candidates, rejected, table)
 
     def _candidates(
@@ -168,6 +219,7 @@ class BlobDetector:
         z: Any,
         table: TablePlane | None,
         seeds: Any,
+        reference: ColourReference,
         rejected: Counter[str],
         cv2: Any,
     ) -> list[_Candidate]:
@@ -175,14 +227,18 @@ class BlobDetector:
         s = self.settings
         most = int(s.largest_share * seeds.size)
         labels, stats = _components(seeds, s.least_pixels, most, cv2)
+        if table is not None and stats:
+            kept = self._clear_of(table, z, stats)
+            rejected["on the table"] += len(stats) - len(kept)
+            stats = kept
         out = []
-        for label, (left, top, width, height, area) in stats[:_MOST_COMPONENTS]:
+        for label, (left, top, width, height, area) in stats[:_MOST_EXAMINED]:
             if area > most:
                 rejected["too large"] += 1
                 continue
             rows = slice(max(top - _MARGIN, 0), min(top + height + _MARGIN, image.shape[0]))
             columns = slice(max(left - _MARGIN, 0), min(left + width + _MARGIN, image.shape[1]))
-            found = self._examine(image[rows, columns], labels[rows, columns], label, cv2)
+            found = self._examine(image[rows, columns], labels[rows, columns], label, reference, cv2)
             if found is None:
                 rejected["no contrast"] += 1
                 continue
@@ -218,7 +274,7 @@ class BlobDetector:
         return out
 
     def _examine(
-        self, rgb: ByteImage, labels: Any, label: int, cv2: Any
+        self, rgb: ByteImage, labels: Any, label: int, reference: ColourReference, cv2: Any
     ) -> tuple[BoolArray, BoolArray, BoolArray, float] | None:
         """Pixels of a component, its ring and its window, and its similarity with the reference."""
         inside = labels == label
@@ -238,8 +294,21 @@ class BlobDetector:
         core = cv2.erode(mine, small).astype(bool)
         core = core if core.sum() >= 4 else inside
         logs = LOG_LIGHT[rgb[core]].astype(float) / LOG_STEPS
-        similarity = self.reference.similarity(logs[:, 0] - logs[:, 1], logs[:, 2] - logs[:, 1])
+        similarity = reference.similarity(logs[:, 0] - logs[:, 1], logs[:, 2] - logs[:, 1])
         return inside, ring, window, similarity
+
+    def _clear_of(self, table: TablePlane, z: Any, stats: list[_Component]) -> list[_Component]:
+        """Components but for those whose middle certainly is on the table: cheap, before any is examined."""
+        boxes = np.array([box for _, box in stats])
+        middle = boxes[:, :2] + boxes[:, 2:4] // 2
+        near = np.arange(-1, 2)
+        u = np.clip(middle[:, 0, None, None] + near[None, None, :], 0, z.shape[1] - 1)
+        v = np.clip(middle[:, 1, None, None] + near[None, :, None], 0, z.shape[0] - 1)
+        values = metres(z[v, u]).reshape(len(stats), 9)
+        values = np.sort(np.where(np.isfinite(values), values, -np.inf), axis=1)
+        # With most of nine pixels known, the fifth largest is the median or nearer than it.
+        low = table.depth(middle.astype(float)) - values[:, 4] < 0.5 * self.settings.least_height
+        return [item for item, on_table in zip(stats, low, strict=True) if not on_table]
 
     def _above(
         self, table: TablePlane, near: FloatArray, inside: BoolArray, window: BoolArray, corner: FloatArray
@@ -345,9 +414,7 @@ class BlobDetector:
         return [(FittedCentre(fitted.centre, fitted.covariance + hidden, fitted.share, fitted.rms), "hidden")]
 
 
-def _components(
-    seeds: Any, least: int, most: int, cv2: Any
-) -> tuple[Any, list[tuple[int, tuple[int, int, int, int, int]]]]:
+def _components(seeds: Any, least: int, most: int, cv2: Any) -> tuple[Any, list[_Component]]:
     """Connected components: labels (h, w), and label and (left, top, width, height, area) of each, the largest first.
 
     A component with several sure insides, or one that is too large, falls into its sure insides: markers whose edges touch, or a
@@ -368,7 +435,10 @@ def _components(
                 sure, 8, cv2.CV_16U, cv2.CCL_BBDT
             )
             sound = [i for i in range(1, found) if parts[i, cv2.CC_STAT_AREA] >= max(least, 4)]
-            if (len(sound) > 1 or (count > most and sound)) and following + len(sound) < 60_000:
+            core = sum(int(parts[i, cv2.CC_STAT_AREA]) for i in sound)
+            # Grey cloth has the colour of a marker's edge, and joins the marker that it half hides.
+            fuzzy = count > most or count > _MOST_FUZZY * core
+            if sound and (len(sound) > 1 or fuzzy) and following + len(sound) < 60_000:
                 labels[box][labels[box] == label] = 0
                 for i in sound:
                     labels[box][inner == i] = following

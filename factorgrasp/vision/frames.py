@@ -69,6 +69,11 @@ class FrameSource:
     def __len__(self) -> int:
         return int(self.t.size)
 
+    @property
+    def compressed(self) -> bool:
+        """Whether the colours went through a lossy compression, which blurs and shifts small spots."""
+        return self.video or any(path.suffix.lower() in (".jpg", ".jpeg") for path in self.images)
+
     def __iter__(self) -> Iterator[Frame]:
         cv2 = load_cv2()
         size: tuple[int, int] | None = None

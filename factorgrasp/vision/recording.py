@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections import Counter
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
@@ -83,6 +84,10 @@ def detect_recording(
         detector = propose_detector(frames, camera)
     elif detector.camera is None:
         detector = BlobDetector(detector.reference, detector.settings, camera)
+    if getattr(frames, "compressed", False):
+        s = detector.settings
+        more = {name: float(np.hypot(getattr(s, name), s.compression_sd)) for name in ("centroid_sd", "hidden_sd")}
+        detector = BlobDetector(detector.reference, replace(s, **more), camera)
     times: list[float] = []
     found: list[DetectedBlobs] = []
     brightest, reasons = 0, Counter[str]()

@@ -39,6 +39,8 @@ class DetectorSettings:
         Of a whole marker's centroid beside the noise of the pixels, px: pixels, texture, shading.
     hidden_sd : float
         The same for a centre found from a part of the outline, px.
+    compression_sd : float
+        What compressed images (video, JPEG) add to either, px: their colours have half the resolution, and blocks.
     depth_correlation : float
         Number of neighbouring depth pixels that share one error.
     most_blobs : int
@@ -53,9 +55,10 @@ class DetectorSettings:
     largest_share: float = 0.004
     greatest_elongation: float = 3.5
     least_height: float = 0.008
-    centroid_sd: float = 0.035
+    centroid_sd: float = 0.03
     hidden_sd: float = 0.10
-    depth_correlation: float = 5.0
+    compression_sd: float = 0.2
+    depth_correlation: float = 3.5
     most_blobs: int = 24
 
     def __post_init__(self) -> None:
