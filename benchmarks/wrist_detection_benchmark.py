@@ -2,15 +2,15 @@
 
     OMP_NUM_THREADS=1 python benchmarks/wrist_detection_benchmark.py [--frames 24] [--seeds 2] [--json out.json]
 
-One reference colour is learnt, from a click in the nominal scene (fair skin, daylight, wooden table); all other rows use it as it is, so that they
-show what a stored reference is worth in another light and on another hand. Row "proposed" has none and finds its own.
+One reference colour is learnt, from a click in the nominal scene (fair skin, daylight, wooden table); all other rows use it as it is, so
+that they show what a stored reference is worth in another light and on another hand. Row "proposed" has none and finds its own.
 
-A marker counts as one to be found when at least 0.3 of it is seen; a blob within 4 px of a marker of which anything is seen is right, every other one is
-wrong. RMSE is of the distance (both coordinates). NEES is per degree of freedom. Time is that of the process for one frame of 640 x 480 with
-depth, images in memory, median over all frames of the row.
+A marker counts as one to be found when at least 0.3 of it is seen; a blob within 4 px of a marker of which anything is seen is right, every
+other one is wrong. RMSE is of the distance (both coordinates). NEES is per degree of freedom. Time is that of the process for one frame of
+640 x 480 with depth, images in memory, median over all frames of the row.
 
-Limits: rendered hands have no hair, rings or sleeves, no shadows, and a lens without colour fringes; the depth noise is a model of a structured-light
-camera (1.2 mm + 1.9 mm/m^2 (z - 0.4 m)^2, neighbouring pixels correlated, shadows, mixed pixels, 2 % missing, 1 % outliers).
+Limits: rendered hands have no hair, rings or sleeves, no shadows, and a lens without colour fringes; the depth noise is a model of a
+structured-light camera (1.2 mm + 1.9 mm/m^2 (z - 0.4 m)^2, neighbouring pixels correlated, shadows, mixed pixels, 2 % missing, 1 % wrong).
 """
 
 from __future__ import annotations
@@ -228,34 +228,63 @@ def targets(results: dict[str, dict[str, float]], calibration: dict[str, float])
         Metric("nominal/recall", nominal["recall"], "", "higher", 0.98),
         Metric("nominal/precision", nominal["precision"], "", "higher", 0.98),
         Metric("nominal/centroid RMSE", nominal["whole_px"], "px", "lower", 0.3),
-        Metric("nominal/centroid NEES", nominal["whole_nees"], "", "within", (0.3, 1.5), "a model error, not noise, dominates"),
+        Metric(
+            "nominal/centroid NEES",
+            nominal["whole_nees"],
+            "",
+            "within",
+            (0.3, 1.5),
+            "a model error, not noise, dominates",
+        ),
         Metric("nominal/depth NEES", nominal["depth_nees"], "", "within", (0.3, 1.5)),
         Metric("nominal/time", nominal["ms"], "ms", "lower", 15.0, "process time, median"),
         Metric("8 mm at 1 m/recall", small["recall"], "", "higher", 0.98),
-        Metric("half hidden/RMSE", results["one marker half hidden"]["part_px"], "px", "lower", 0.5, "its centroid is off by 2 px"),
+        Metric(
+            "half hidden/RMSE",
+            results["one marker half hidden"]["part_px"],
+            "px",
+            "lower",
+            0.5,
+            "its centroid is off by 2 px",
+        ),
         Metric("half hidden/NEES", results["one marker half hidden"]["part_nees"], "", "lower", 2.0),
-        Metric("calibration/error of a marker", calibration["calibration_mm"], "mm", "none", None, "median of hands, 6 frames"),
+        Metric(
+            "calibration/error of a marker",
+            calibration["calibration_mm"],
+            "mm",
+            "none",
+            None,
+            "median of hands, 6 frames",
+        ),
         Metric("calibration/NEES", calibration["calibration_nees"], "", "within", (0.3, 1.5)),
-        Metric("calibration/NEES without systematic_sd", calibration["calibration_nees_noise_only"], "", "none"),
+        Metric(
+            "calibration/NEES without systematic_sd", calibration["calibration_nees_noise_only"], "", "none"
+        ),
     ]
     return out
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--frames", type=int, default=24, help="of a row and seed")
     parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--hands", type=int, default=10, help="calibrated")
     parser.add_argument("--only", default="", help="rows whose name holds this")
     parser.add_argument("--json", type=Path, help="where to write all numbers")
     chosen = parser.parse_args(arguments)
-    print(f"{platform.processor() or platform.machine()}, Python {platform.python_version()}, numpy {np.__version__}, OpenCV {version('opencv-python-headless')}")
+    machine = platform.processor() or platform.machine()
+    opencv = version("opencv-python-headless")
+    print(f"{machine}, Python {platform.python_version()}, numpy {np.__version__}, OpenCV {opencv}")
     first = make_video(replace(ROWS[0]), 1, 1000).frame(0)
     reference = learn_colour(first.rgb, click=(float(first.uv[3, 0]), float(first.uv[3, 1])))
     rows = [row for row in ROWS if chosen.only in row.name]
     results = {}
     print(f"{chosen.seeds} recordings of {chosen.frames} frames a row")
-    print("| setting | recall | precision | whole: RMSE px | NEES | part: RMSE px | NEES | depth RMSE mm | NEES | ms | ms 99 % |")
+    print(
+        "| setting | recall | precision | whole: RMSE px | NEES | part: RMSE px | NEES | depth RMSE mm | NEES | ms | ms 99 % |"
+    )
     print("|---|---|---|---|---|---|---|---|---|---|---|")
     for row in rows:
         r = results[row.name] = run_row(row, reference, chosen.frames, chosen.seeds)
@@ -272,7 +301,9 @@ def main(arguments: list[str] | None = None) -> int:
     metrics = targets(results, calibration)
     print(metric_table(metrics, "Targets").text())
     if chosen.json:
-        chosen.json.write_text(json.dumps({"rows": results, **calibration}, indent=1) + "\n", encoding="utf-8")
+        chosen.json.write_text(
+            json.dumps({"rows": results, **calibration}, indent=1) + "\n", encoding="utf-8"
+        )
     return sum(metric.passed is False for metric in metrics)
 
 

@@ -81,8 +81,8 @@ def calibrate_palm(
 ) -> PalmCalibration:
     """The layout from the first frames in which all markers are seen with depth.
 
-    Every labelling of a frame's points is compared with a template hand of any usual size; with the layout of the frames before once there is
-    one. Layout and poses then come from one least-squares fit, weighted by the blobs' covariances.
+    Every labelling of a frame's points is compared with a template hand of any usual size; with the layout of the frames before once
+    there is one. Layout and poses then come from one least-squares fit, weighted by the blobs' covariances.
 
     Parameters
     ----------
@@ -112,7 +112,11 @@ def calibrate_palm(
     if side not in ("right", "left") or facing not in ("back", "palm"):
         raise InputError("side, facing", "right or left, and back or palm", f"{side!r}, {facing!r}")
     if frames < 1 or look < 1 or not 0.0 <= systematic_sd < 0.1:
-        raise InputError("frames, look, systematic_sd", "at least 1, at least 1, metres", f"{frames}, {look}, {systematic_sd:g}")
+        raise InputError(
+            "frames, look, systematic_sd",
+            "at least 1, at least 1, metres",
+            f"{frames}, {look}, {systematic_sd:g}",
+        )
     if template is None:
         standard = MarkerLayout.palm()
         mirror = np.array([1.0, -1.0 if (side == "left") != (facing == "palm") else 1.0, 1.0])
@@ -122,7 +126,9 @@ def calibrate_palm(
     convention = PalmConvention.of(template.names)
     views, used, rows, scale = _collect(blobs, camera, template, frames, look, convention)
     start = np.mean([(view.points - view.position) @ view.rotation for view in views], axis=0)
-    problem = PalmLayout(template.names, start, views, convention, make_loss("huber", 3.0) if len(views) > 2 else None)
+    problem = PalmLayout(
+        template.names, start, views, convention, make_loss("huber", 3.0) if len(views) > 2 else None
+    )
     estimate = solve(problem)
     if not estimate.solved:
         raise NotSolvedError(f"palm calibration: {estimate.message}")
@@ -150,7 +156,12 @@ def _moved(layout: MarkerLayout) -> FloatArray:
 
 
 def _collect(
-    blobs: BlobRecording, camera: Camera, template: MarkerLayout, most: int, look: int, convention: PalmConvention
+    blobs: BlobRecording,
+    camera: Camera,
+    template: MarkerLayout,
+    most: int,
+    look: int,
+    convention: PalmConvention,
 ) -> tuple[list[PalmView], list[int], list[IntArray], float]:
     """Labelled frames, their numbers, the blobs of the markers, and the size of the hand."""
     markers = len(template)

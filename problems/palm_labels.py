@@ -46,8 +46,8 @@ def label_points(
 ) -> Labelling | None:
     """The labelling under which the points are most similar to a template.
 
-    Every choice of points for the markers is aligned by rotation, translation and scale (Umeyama 1991); of those whose scale is that of a hand
-    the one with the smallest residual is taken.
+    Every choice of points for the markers is aligned by rotation, translation and scale (Umeyama 1991); of those whose scale is that of a
+    hand the one with the smallest residual is taken.
 
     Parameters
     ----------
@@ -69,7 +69,8 @@ def label_points(
     if not markers <= count <= MOST_POINTS:
         return None
     orders = np.array(
-        [order for chosen in combinations(range(count), markers) for order in permutations(chosen)], dtype=np.intp
+        [order for chosen in combinations(range(count), markers) for order in permutations(chosen)],
+        dtype=np.intp,
     )
     model = template - template.mean(axis=0)
     chosen = points[orders]

@@ -50,12 +50,16 @@ class PalmConvention:
         """The convention for markers by their names; by position (first, then all others) where the names are not those of a palm."""
         names = list(names)
         if "wrist" in names and "middle_mcp" in names:
-            level = tuple(i for i, name in enumerate(names) if name.endswith("_mcp") and not name.startswith("thumb"))
+            level = tuple(
+                i for i, name in enumerate(names) if name.endswith("_mcp") and not name.startswith("thumb")
+            )
             return cls(names.index("wrist"), names.index("middle_mcp"), level)
         return cls(0, 1, tuple(range(1, len(names))))
 
 
-def palm_frame(points: FloatArray, convention: PalmConvention, up: FloatArray) -> tuple[FloatArray, FloatArray]:
+def palm_frame(
+    points: FloatArray, convention: PalmConvention, up: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """The frame W of markers: origin at the wrist marker, x to the middle finger's, z normal to the palm.
 
     z is that direction normal to x about which the markers at the fingers' joints are level: ``sum y_i z_i = 0`` with the smaller
@@ -99,7 +103,9 @@ def in_palm_frame(layout: MarkerLayout, convention: PalmConvention | None = None
         return np.asarray(((points - p) @ R).ravel())
 
     flat, step = layout.points.ravel(), 1e-6
-    J = np.column_stack([(express(flat + d) - express(flat - d)) / (2.0 * step) for d in step * np.eye(flat.size)])
+    J = np.column_stack(
+        [(express(flat + d) - express(flat - d)) / (2.0 * step) for d in step * np.eye(flat.size)]
+    )
     covariance = J @ layout.covariance @ J.T
     return MarkerLayout(layout.names, express(flat).reshape(-1, 3), 0.5 * (covariance + covariance.T))
 
@@ -127,8 +133,8 @@ class PalmView:
 class PalmLayout:
     """The layout of the markers as a nonlinear problem.
 
-    Variables are ``layout`` (coordinates of all markers but the origin, and x of the marker ahead) and a rotation and a translation for each
-    frame.
+    Variables are ``layout`` (coordinates of all markers but the origin, and x of the marker ahead) and a rotation and a translation for
+    each frame.
 
     Parameters
     ----------

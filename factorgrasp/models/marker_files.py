@@ -42,7 +42,9 @@ def read_layout(path: str | Path) -> MarkerLayout:
         raise InputError(str(file), "a marker layout (JSON)", "no such file") from None
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(
-            str(file), "a marker layout: JSON with names, points and covariance", f"{type(error).__name__}: {error}"
+            str(file),
+            "a marker layout: JSON with names, points and covariance",
+            f"{type(error).__name__}: {error}",
         ) from error
     try:
         return MarkerLayout(names, points, covariance if covariance.size else np.zeros((0, 0)))

@@ -126,8 +126,8 @@ class _Look:
 class BlobDetector:
     """Finds markers of one colour.
 
-    It remembers one thing from image to image: the lamp. When fewer than six blobs are found and the colours of the whole image have shifted as
-    another lamp shifts them, the reference is shifted likewise and, if that finds more, kept so.
+    It remembers one thing from image to image: the lamp. When fewer than six blobs are found and the colours of the image have shifted
+    as another lamp shifts them, the reference is shifted likewise and, if that finds more, kept so.
 
     Parameters
     ----------

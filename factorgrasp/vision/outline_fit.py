@@ -146,7 +146,7 @@ def split_blob(blob: SoftBlob, moment: FloatArray, count: int, blur: float = 1.3
             break
         centre = accepted + np.clip(step, -2.0, 2.0)
     noise = max(previous / max(alpha.size - 2 * count, 1), blob.alpha_variance)
-    covariance: FloatArray = np.linalg.inv(information + 1e-2 * np.eye(2 * count)) * noise
+    covariance = np.asarray(np.linalg.inv(information + 1e-2 * np.eye(2 * count)) * noise, dtype=float)
     rms = float(np.sqrt(previous / alpha.size))
     return [
         FittedCentre(accepted[i], covariance[2 * i : 2 * i + 2, 2 * i : 2 * i + 2], 1.0, rms)

@@ -86,8 +86,12 @@ def detect_recording(
         detector = BlobDetector(detector.reference, detector.settings, camera)
     if getattr(frames, "compressed", False):
         s = detector.settings
-        more = {name: float(np.hypot(getattr(s, name), s.compression_sd)) for name in ("centroid_sd", "hidden_sd")}
-        detector = BlobDetector(detector.reference, replace(s, **more), camera)
+        worse = replace(
+            s,
+            centroid_sd=float(np.hypot(s.centroid_sd, s.compression_sd)),
+            hidden_sd=float(np.hypot(s.hidden_sd, s.compression_sd)),
+        )
+        detector = BlobDetector(detector.reference, worse, camera)
     times: list[float] = []
     found: list[DetectedBlobs] = []
     brightest, reasons = 0, Counter[str]()

@@ -34,7 +34,7 @@ class DetectorSettings:
     greatest_elongation : float
         Ratio of its axes.
     least_height : float
-        Above the table, m.
+        Above the table, m: more than pens, less than the flat hand of a child.
     centroid_sd : float
         Of a whole marker's centroid beside the noise of the pixels, px: pixels, texture, shading.
     hidden_sd : float
@@ -54,7 +54,7 @@ class DetectorSettings:
     least_pixels: int = 2
     largest_share: float = 0.004
     greatest_elongation: float = 3.5
-    least_height: float = 0.008
+    least_height: float = 0.012
     centroid_sd: float = 0.03
     hidden_sd: float = 0.10
     compression_sd: float = 0.2

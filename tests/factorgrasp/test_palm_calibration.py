@@ -22,7 +22,12 @@ R_DOWN = np.diag([1.0, -1.0, -1.0])
 
 
 def make_blobs(
-    layout: np.ndarray, rng: np.random.Generator, frames: int = 6, sd: float = 0.3, sd_z: float = 1e-3, clutter: int = 1
+    layout: np.ndarray,
+    rng: np.random.Generator,
+    frames: int = 6,
+    sd: float = 0.3,
+    sd_z: float = 1e-3,
+    clutter: int = 1,
 ) -> tuple[BlobRecording, np.ndarray]:
     """A hand that moves a little, its blobs in random order with clutter; and the row of each marker (frames, n)."""
     uv, z, frame, rows = [], [], [], []
@@ -127,7 +132,10 @@ def test_what_cannot_be_calibrated_is_said() -> None:
     with pytest.raises(InputError, match="at most 5 blobs with depth in the first 6 frames"):
         calibrate_palm(without, CAMERA)
     scattered = BlobRecording(
-        blobs.t, blobs.frame, rng.uniform(100.0, 400.0, blobs.uv.shape), rng.uniform(0.5, 1.0, blobs.depth.shape)
+        blobs.t,
+        blobs.frame,
+        rng.uniform(100.0, 400.0, blobs.uv.shape),
+        rng.uniform(0.5, 1.0, blobs.depth.shape),
     )
     with pytest.raises(InputError, match="like the markers of a hand"):
         calibrate_palm(scattered, CAMERA)
@@ -157,7 +165,9 @@ def test_derivatives_of_the_problem_by_finite_differences() -> None:
         moved = []
         for sign in (1.0, -1.0):
             fresh = PalmLayout(PALM_NAMES, layout, views)
-            moved.append(-fresh.linearize(problem.retract(state, sign * step * np.eye(size)[i])).whitened()[1])
+            moved.append(
+                -fresh.linearize(problem.retract(state, sign * step * np.eye(size)[i])).whitened()[1]
+            )
         numeric[:, i] = (moved[0] - moved[1]) / (2.0 * step)
     scale = np.abs(matrix).max(axis=1, keepdims=True)
     np.testing.assert_allclose(matrix / scale, numeric / scale, atol=1e-5)

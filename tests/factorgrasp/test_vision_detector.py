@@ -13,9 +13,6 @@ from factorgrasp.models.markers import PALM_POINTS
 from factorgrasp.simulation.hand_motion import R_CAMERA_NEUTRAL, swinging_hand
 from factorgrasp.simulation.hand_rendering import RenderedFrame, render_hand
 from factorgrasp.simulation.hand_scene import HandScene, Hidden
-
-pytest.importorskip("cv2", reason="OpenCV is not installed: pip install 'factorgrasp[vision]'")
-
 from factorgrasp.vision import (
     BlobDetector,
     ColourReference,
@@ -30,6 +27,8 @@ from factorgrasp.vision.light import light_shift
 from factorgrasp.vision.outline_fit import fit_outline
 from factorgrasp.vision.soft_blob import polygon_moments
 from factorgrasp.vision.table_plane import fit_table
+
+pytest.importorskip("cv2", reason="OpenCV is not installed: pip install 'factorgrasp[vision]'")
 
 CAMERA = Camera(300.0, 300.0, 159.5, 119.5, 320, 240)
 DISTANCE = 0.42
@@ -132,8 +131,12 @@ def test_touching_and_overlapping_markers_are_two(reference: ColourReference) ->
 
 def test_small_marker_far_away_is_found(reference: ColourReference) -> None:
     scene = HandScene(marker_diameter=0.008)
-    frame = swinging_hand(1, scene, 0, 300.0 / 525.0, camera=CAMERA).frame(0)  # as many pixels as at 1 m with 525 px
-    blobs = BlobDetector(reference, DetectorSettings(marker_diameter=0.008), CAMERA).detect(frame.rgb, frame.depth)
+    frame = swinging_hand(1, scene, 0, 300.0 / 525.0, camera=CAMERA).frame(
+        0
+    )  # as many pixels as at 1 m with 525 px
+    blobs = BlobDetector(reference, DetectorSettings(marker_diameter=0.008), CAMERA).detect(
+        frame.rgb, frame.depth
+    )
     away, _ = nearest(blobs, frame)
     assert away.max() < 0.4
 
@@ -158,7 +161,7 @@ def test_images_that_do_not_fit_are_refused(reference: ColourReference) -> None:
         detector.detect(frame.rgb / 255.0)
     with pytest.raises(InputError, match="alpha"):
         detector.detect(np.dstack([frame.rgb, frame.rgb[..., :1]]))
-    with pytest.raises(InputError, match="registered|Register"):
+    with pytest.raises(InputError, match="Register"):
         detector.detect(frame.rgb, frame.depth[:, :100])
     with pytest.raises(InputError, match="Millimetres"):
         detector.detect(frame.rgb, np.rint(1e3 * frame.depth).astype(np.uint16))
@@ -168,7 +171,13 @@ def test_images_that_do_not_fit_are_refused(reference: ColourReference) -> None:
 
 @pytest.mark.parametrize(
     "settings",
-    [{"region": "hand"}, {"threshold": 1.5}, {"marker_diameter": 12.0}, {"centroid_sd": -1.0}, {"least_height": np.nan}],
+    [
+        {"region": "hand"},
+        {"threshold": 1.5},
+        {"marker_diameter": 12.0},
+        {"centroid_sd": -1.0},
+        {"least_height": np.nan},
+    ],
 )
 def test_settings_that_cannot_be_are_refused(settings: dict[str, object]) -> None:
     with pytest.raises(InputError, match=next(iter(settings))):
@@ -177,10 +186,10 @@ def test_settings_that_cannot_be_are_refused(settings: dict[str, object]) -> Non
 
 def test_a_click_on_the_background_is_refused() -> None:
     frame = hand()
-    with pytest.raises(InputError, match="background|marker"):
+    with pytest.raises(InputError, match="marker"):
         learn_colour(frame.rgb, click=(5, 5))
     hidden = np.rint(frame.uv[0]).astype(int) - [20, 0]
-    with pytest.raises(InputError, match="background|marker"):
+    with pytest.raises(InputError, match="marker"):
         learn_colour(frame.rgb, click=(int(hidden[0]), int(hidden[1])))
     with pytest.raises(InputError, match="within 320 x 240"):
         learn_colour(frame.rgb, click=(400, 10))
@@ -208,7 +217,11 @@ def test_click_patch_and_mask_learn_the_same_colour(tmp_path: Path) -> None:
 
 
 def test_the_reference_is_proposed_when_none_is_given() -> None:
-    for scene in (HandScene(), HandScene(skin="dark", light=0.6), HandScene(marker_colour=(0.04, 0.35, 0.06), table="grey")):
+    for scene in (
+        HandScene(),
+        HandScene(skin="dark", light=0.6),
+        HandScene(marker_colour=(0.04, 0.35, 0.06), table="grey"),
+    ):
         frame = hand(scene, seed=3)
         for depth in (frame.depth, None):
             blobs = BlobDetector(propose_colour(frame.rgb, depth), camera=CAMERA).detect(frame.rgb, depth)
@@ -228,7 +241,9 @@ def test_table_plane_is_found_under_a_hand() -> None:
     noisy[rng.random(depth.shape) < 0.1] = 0.0
     table = fit_table(noisy)
     assert table is not None
-    np.testing.assert_allclose(table.depth([[10.0, 10.0], [150.0, 100.0]]), [depth[10, 10], depth[100, 150]], atol=2e-3)
+    np.testing.assert_allclose(
+        table.depth([[10.0, 10.0], [150.0, 100.0]]), [depth[10, 10], depth[100, 150]], atol=2e-3
+    )
     assert fit_table(np.zeros((120, 160))) is None
     only_hand = np.where(noisy < 0.7, noisy, 0.0)
     assert fit_table(only_hand) is None
@@ -264,7 +279,9 @@ def test_outline_fit_finds_the_centre_of_a_half() -> None:
     points = np.column_stack([4.5 * np.cos(turn), 4.5 * np.sin(turn)])
     points[:, 0] = np.maximum(points[:, 0], -0.5)
     rng = np.random.default_rng(2)
-    found = fit_outline(points + rng.normal(0.0, 0.1, points.shape), np.eye(2) * 4.5**2 / 4.0, np.array([1.5, 0.0]))
+    found = fit_outline(
+        points + rng.normal(0.0, 0.1, points.shape), np.eye(2) * 4.5**2 / 4.0, np.array([1.5, 0.0])
+    )
     assert np.linalg.norm(found.centre) < 0.25
     assert 0.4 < found.share < 0.8
 

@@ -11,14 +11,13 @@ import pytest
 from factorgrasp.errors import InputError
 from factorgrasp.models.camera import Camera
 from factorgrasp.palm_calibration import calibrate_palm
+from factorgrasp.simulation.hand_files import write_frames
 from factorgrasp.simulation.hand_motion import swinging_hand
 from factorgrasp.simulation.hand_rendering import HandVideo
-
-cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed: pip install 'factorgrasp[vision]'")
-
-from factorgrasp.simulation.hand_files import write_frames
 from factorgrasp.vision import Frame, detect_recording, learn_colour, propose_detector, read_frames
 from factorgrasp.vision.problem_table import blobs_from_table
+
+cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed: pip install 'factorgrasp[vision]'")
 
 CAMERA = Camera(300.0, 300.0, 159.5, 119.5, 320, 240)
 
@@ -53,7 +52,9 @@ def test_written_frames_are_read_back(folder: Path, video: HandVideo) -> None:
 
 @pytest.mark.parametrize("depth", [True, False])
 @pytest.mark.parametrize("movie", [False, True])
-def test_a_recording_is_detected_and_calibrated(folder: Path, video: HandVideo, depth: bool, movie: bool) -> None:
+def test_a_recording_is_detected_and_calibrated(
+    folder: Path, video: HandVideo, depth: bool, movie: bool
+) -> None:
     where = {"video": folder / "movie.avi"} if movie else {"images": folder / "rgb"}
     source = read_frames(**where, depth=folder / "depth" if depth else None)
     blobs = detect_recording(source, CAMERA)
@@ -66,7 +67,12 @@ def test_a_recording_is_detected_and_calibrated(folder: Path, video: HandVideo, 
     assert np.isfinite(blobs.depth).all() == depth
     if depth and not movie:
         found = calibrate_palm(blobs, CAMERA)
-        assert np.abs(found.layout.distances - np.linalg.norm(video.layout[:, None] - video.layout, axis=2)).max() < 2e-3
+        assert (
+            np.abs(
+                found.layout.distances - np.linalg.norm(video.layout[:, None] - video.layout, axis=2)
+            ).max()
+            < 2e-3
+        )
     if not depth:
         with pytest.raises(InputError, match="0 blobs with depth"):
             calibrate_palm(blobs, CAMERA)
@@ -93,7 +99,7 @@ def test_a_table_of_a_problem_file_names_images(folder: Path) -> None:
 def test_folders_that_do_not_fit_are_refused(copy: Path) -> None:
     with pytest.raises(InputError, match="no folder"):
         read_frames(images=copy / "rgb", depth=copy / "depht")
-    with pytest.raises(InputError, match="either|neither|both"):
+    with pytest.raises(InputError, match="neither"):
         read_frames()
     with pytest.raises(InputError, match="no file"):
         read_frames(video=copy / "none.avi")
