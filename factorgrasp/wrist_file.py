@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -13,6 +12,7 @@ from factorgrasp.errors import InputError
 from factorgrasp.kinematics.angles import Facing, Hand
 from factorgrasp.lie import quaternion_wxyz_to_matrix
 from factorgrasp.models.camera import Camera
+from factorgrasp.models.marker_files import read_layout as read_stored
 from factorgrasp.models.markers import PALM_NAMES, MarkerLayout
 from factorgrasp.problems.wrist_settings import WristAssociation, WristNoise, WristSettings
 from factorgrasp.problems.wrist_track import CameraPose
@@ -183,12 +183,12 @@ def _layout(points: np.ndarray, table: Mapping[str, Any], where: str) -> MarkerL
 
 
 def _layout_file(path: Path, table: Mapping[str, Any]) -> MarkerLayout:
-    """A stored layout: JSON as the calibration writes it, or a table with the columns ``x,y,z``."""
+    """A stored layout: JSON of a calibration or of an estimate, or a table with the columns ``x,y,z`` and perhaps ``sd``."""
     for key in ("names", "sd"):
         if key in table and path.suffix.lower() == ".json":
             raise InputError(place("[markers]", key), "a layout written in this file", f"a layout in {path}")
     if path.suffix.lower() == ".json":
-        return read_layout_json(path)
+        return read_stored(path)
     from factorgrasp.recordings.tables import read_table
 
     columns = read_table(path, ("x", "y", "z"), ("sd",))
@@ -196,32 +196,6 @@ def _layout_file(path: Path, table: Mapping[str, Any]) -> MarkerLayout:
     if "sd" in columns and "sd" not in table:
         table = {**table, "sd": columns["sd"].tolist()}
     return _layout(points, table, str(path))
-
-
-def read_layout_json(path: Path) -> MarkerLayout:
-    """A layout from JSON: ``points`` (n, 3), m, with ``names`` and ``sd`` or ``covariance`` (3n, 3n); an ``estimate.json`` will do, too."""
-    try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(str(path), "a marker layout (JSON)", "no such file") from None
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise InputError(str(path), "a marker layout (JSON)", str(error)) from None
-    if isinstance(record, Mapping) and isinstance(record.get("layout"), Mapping):
-        record = record["layout"]  # of an estimate
-    if not isinstance(record, Mapping) or "points" not in record:
-        raise InputError(str(path), "a marker layout with points", describe(record))
-    where = str(path)
-    points = np.array(
-        [convert(point, _Vector, f"{where}: points {k}") for k, point in enumerate(record["points"], 1)]
-    ).reshape(-1, 3)
-    if record.get("covariance") is None:
-        return _layout(points, {key: record[key] for key in ("names", "sd") if key in record}, where)
-    names = get(record, "names", tuple[str, ...], where)
-    try:
-        covariance = np.array(record["covariance"], dtype=float)
-    except (TypeError, ValueError):
-        raise InputError(f"{where}: covariance", "a matrix of numbers", "something else") from None
-    return MarkerLayout(names, points, covariance)
 
 
 def read_blob_source(
@@ -233,9 +207,9 @@ def read_blob_source(
     if len(sources) != 1:
         raise InputError(where, "one of file, video and images", " and ".join(sources) or "none of them")
     if sources[0] != "file":
-        from factorgrasp.wrist_images import detect_blobs
+        from factorgrasp.vision.problem_table import blobs_from_table
 
-        blobs, remarks = detect_blobs(table, base_dir, camera)
+        blobs, remarks = blobs_from_table(table, base_dir, camera)
         return blobs, (*remarks, *blob_remarks(blobs, camera))
     check_keys(table, ("file",), where)
     blobs = read_blobs(base_dir / get(table, "file", str, where), camera)
