@@ -13,7 +13,8 @@ from factorgrasp import lie
 from factorgrasp.estimate import Estimate
 from factorgrasp.models.markers import MarkerLayout
 from factorgrasp.problems.wrist_chain import Marginals, marginals
-from factorgrasp.problems.wrist_frames import in_start_frame, start_pose
+from factorgrasp.problems.wrist_flat import DECIDED, second_pose
+from factorgrasp.problems.wrist_frames import StartFrame, in_start_frame, start_pose
 from factorgrasp.problems.wrist_model import Pairs
 from factorgrasp.problems.wrist_rows import Rows
 from factorgrasp.problems.wrist_track import CameraPose, Gap, WristTrack
@@ -134,11 +135,14 @@ def _nodes(
     """One node a frame of the recording; those outside of the batch as the first pass left them."""
     out = list(problem.first_pass.nodes)
     for i, k in enumerate(problem.frames):
+        covariance = found.nodes[i]
+        if problem.first_pass.nodes[k].ambiguous:
+            covariance = _with_doubt(problem, k, R[i], x[i], covariance)
         out[k] = Node(
             float(problem.blobs.t[k]),
             R[i],
             x[i],
-            found.nodes[i],
+            covariance,
             found.with_border[i, :, :shared],
             False,
             bool(used[k]),
@@ -147,10 +151,26 @@ def _nodes(
     return out
 
 
+def _with_doubt(
+    problem: WristPose, k: int, R: FloatArray, x: FloatArray, covariance: FloatArray
+) -> FloatArray:
+    """The covariance of a node with the second pose that its pixels allow in it."""
+    rows = problem.blobs.rows(k)
+    uvz = np.concatenate([problem.blobs.uv[rows], problem.blobs.depth[rows, None]], axis=1)
+    marker = problem.association_now[rows] - 1
+    layout = problem.markers
+    other = second_pose(
+        problem.camera, layout.points, layout.blocks, R, x[:3], uvz, problem.covariances[rows], marker
+    )
+    if other is None or other[1] > DECIDED:
+        return covariance
+    out = covariance.copy()
+    out[:6, :6] += 0.5 * np.outer(other[0], other[0])
+    return out
+
+
 def first_frames(problem: WristPose, nodes: Sequence[Node], markers: MarkerLayout) -> CameraPose:
     """``W0``: the hand in its first frames, as long as it is at rest."""
-    from factorgrasp.problems.wrist_frames import StartFrame
-
     exact = problem.settings.layout == "exact"
     covariance = np.zeros_like(markers.covariance) if exact else markers.covariance
     start = StartFrame(problem.camera, markers.points, covariance, problem.settings.start_frames)

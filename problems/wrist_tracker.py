@@ -30,7 +30,8 @@ _MEMORY_FRAMES = 300.0
 _MEMORY_SECONDS = 3.0
 _DENSITY_WEIGHT = 3.0
 _DENSITY_BOUNDS = (0.03, 30.0)
-_NEAR = 1e-3
+_DECISIVE_FRAMES = 8
+"""Frames in a row that have to decide between two poses before one of them is believed without reserve."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +137,7 @@ class WristTracker:
         self._poor = 0
         self._shallow = 0
         self._last_doubt: FloatArray | None = None
-        self._against = 0
+        self._against = self._decisive = 0
         self._handed_over: list[tuple[int, Node]] = []
 
     # ---- what is known
@@ -264,6 +265,8 @@ class WristTracker:
         covariance: FloatArray,
         finished: list[tuple[int, Node]],
     ) -> Step:
+        if not np.isfinite(uvz[found.assignment.marker >= 0, 2]).any():
+            self._last_doubt, self._decisive = np.zeros(6), 0
         self.window.start(t, found.R, found.p, POSE_SD, RATE_SD)
         marker = found.assignment.marker
         x = self.window.x[-1]
@@ -406,17 +409,23 @@ class WristTracker:
         if np.isfinite(uvz[:, 2]).any() and self._last_doubt is None:
             # A camera with depth whose few markers lack it just now: the track remembers which of the two poses it was.
             return None
-        other = second_pose(self.camera, self.window.layout, self._blocks, R, p, uvz, covariance, marker)
+        # Judged by the layout as it was measured: one that was learnt under a wrong pose would speak for it.
+        points = self.markers.points
+        other = second_pose(self.camera, points, self._blocks, R, p, uvz, covariance, marker)
         s = self.window.shared
         P = self.window.covariance_newest[s : s + 3, s : s + 3]
         loose = float(np.sqrt(np.linalg.eigvalsh(P)[-1])) > LOOSE
         if other is not None and other[1] < DECIDED:
-            self._last_doubt = other[0]
+            self._last_doubt, self._decisive = other[0], 0
             self._against = self._against + 1 if other[1] < -DECIDED else 0
         elif loose or np.count_nonzero(used) < 4:
             self._last_doubt = np.zeros(6) if self._last_doubt is None else self._last_doubt
-        else:
-            self._last_doubt, self._against = None, 0
+            self._decisive = 0
+        elif other is not None:
+            self._against = 0
+            self._decisive += 1
+            if self._decisive >= _DECISIVE_FRAMES:
+                self._last_doubt = None
         return self._last_doubt
 
     def _count(self, marker: IntArray, predicted: Prediction) -> None:

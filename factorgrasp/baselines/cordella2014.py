@@ -1,7 +1,7 @@
 """The estimator printed in Cordella et al. 2014: an augmented unscented Kalman filter with blob-by-blob association.
 
-State ``T, v, R`` of the wrist in the start frame, driven by white acceleration and white angular rate (equation 5), predicted projections by
-sigma points (9 to 11), every blob to its most probable marker or to clutter (12). Two readings of it:
+State ``T, v, R`` of the wrist in the start frame, driven by white acceleration and white angular rate (equation 5), predicted projections
+by sigma points (9 to 11), every blob to its most probable marker or to clutter (12). Two readings of it:
 
 - as printed: image points only and the rotation as ZYZ Euler angles. That sequence is singular at the neutral posture, where the filter
   starts, so it is kept for the record only;

@@ -163,6 +163,11 @@ class OnlineWristPose:
         """Blobs a frame that are no marker."""
         return self._tracker.clutter
 
+    @property
+    def held(self) -> int:
+        """Frames that are kept; never more than the lag and one."""
+        return self._tracker.held
+
     # ---- the stream
 
     def push(
