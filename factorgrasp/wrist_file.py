@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -10,8 +9,10 @@ from typing import Any, Literal
 import numpy as np
 
 from factorgrasp.errors import InputError
+from factorgrasp.kinematics.angles import Facing, Hand
 from factorgrasp.lie import quaternion_wxyz_to_matrix
 from factorgrasp.models.camera import Camera
+from factorgrasp.models.marker_files import read_layout as read_stored
 from factorgrasp.models.markers import PALM_NAMES, MarkerLayout
 from factorgrasp.problems.wrist_settings import WristAssociation, WristNoise, WristSettings
 from factorgrasp.problems.wrist_track import CameraPose
@@ -62,10 +63,12 @@ def build(table: Mapping[str, Any], base_dir: Path) -> WristTask:
         {key: value for key, value in estimate.items() if key not in ("method", "hand")},
         "[estimate]",
     )
+    facing = get(markers_table, "facing", Literal["back", "palm"], "[markers]", "back")
     layout = read_layout(markers_table, base_dir)
-    blobs, remarks = read_blob_source(blobs_table, base_dir, camera, layout)
+    blobs, remarks = read_blob_source(blobs_table, base_dir, camera)
     if layout is None:
-        layout, more = _layout_from(blobs, camera, markers_table, noise)
+        names = get(markers_table, "names", tuple[str, ...], "[markers]", None)
+        layout, more = _calibrated(blobs, camera, hand, facing, names)
         remarks = (*remarks, *more)
     return WristTask(
         camera,
@@ -77,6 +80,7 @@ def build(table: Mapping[str, Any], base_dir: Path) -> WristTask:
         camera_pose=camera_pose,
         method=method,
         hand=hand,
+        facing=facing,
         remarks=remarks,
     )
 
@@ -101,9 +105,7 @@ def read_camera(table: Mapping[str, Any]) -> tuple[Camera, CameraPose | None]:
     distortion = get(table, "distortion", tuple[float, ...], where, ())
     rate = get(table, "rate", float, where, 30.0)
     try:
-        camera = Camera(
-            float(fx), float(fy), float(cx), float(cy), width, height, tuple(distortion), rate
-        )
+        camera = Camera(float(fx), float(fy), float(cx), float(cy), width, height, tuple(distortion), rate)
     except InputError as error:
         raise InputError(
             error.field.replace("camera:", where), error.expected, error.found, error.hint
@@ -137,7 +139,7 @@ def _camera_pose(table: Mapping[str, Any], where: str) -> CameraPose | None:
 def read_layout(table: Mapping[str, Any], base_dir: Path) -> MarkerLayout | None:
     """[markers]: the layout, or None where it has to come out of the recording (``layout = "estimate"``)."""
     where = "[markers]"
-    check_keys(table, ("layout", "names", "sd"), where)
+    check_keys(table, ("layout", "names", "sd", "facing"), where)
     value = table.get("layout")
     if value is None:
         raise InputError(
@@ -158,7 +160,9 @@ def read_layout(table: Mapping[str, Any], base_dir: Path) -> MarkerLayout | None
 
 
 def _layout(points: np.ndarray, table: Mapping[str, Any], where: str) -> MarkerLayout:
-    default = PALM_NAMES if len(points) == len(PALM_NAMES) else tuple(f"marker_{k + 1}" for k in range(len(points)))
+    default = (
+        PALM_NAMES if len(points) == len(PALM_NAMES) else tuple(f"marker_{k + 1}" for k in range(len(points)))
+    )
     names = get(table, "names", tuple[str, ...], where, default)
     if len(names) != len(points):
         raise InputError(place(where, "names"), f"{len(points)} names, one a marker", f"{len(names)}")
@@ -175,18 +179,16 @@ def _layout(points: np.ndarray, table: Mapping[str, Any], where: str) -> MarkerL
     try:
         return MarkerLayout.with_sd(tuple(names), points, float(sds[0]) if sds.size == 1 else sds)
     except InputError as error:
-        raise InputError(
-            place(where, "layout"), error.expected, error.found, error.hint
-        ) from error
+        raise InputError(place(where, "layout"), error.expected, error.found, error.hint) from error
 
 
 def _layout_file(path: Path, table: Mapping[str, Any]) -> MarkerLayout:
-    """A stored layout: JSON as the calibration writes it, or a table with the columns ``x,y,z``."""
+    """A stored layout: JSON of a calibration or of an estimate, or a table with the columns ``x,y,z`` and perhaps ``sd``."""
     for key in ("names", "sd"):
         if key in table and path.suffix.lower() == ".json":
             raise InputError(place("[markers]", key), "a layout written in this file", f"a layout in {path}")
     if path.suffix.lower() == ".json":
-        return read_layout_json(path)
+        return read_stored(path)
     from factorgrasp.recordings.tables import read_table
 
     columns = read_table(path, ("x", "y", "z"), ("sd",))
@@ -196,34 +198,8 @@ def _layout_file(path: Path, table: Mapping[str, Any]) -> MarkerLayout:
     return _layout(points, table, str(path))
 
 
-def read_layout_json(path: Path) -> MarkerLayout:
-    """A layout from JSON: ``points`` (n, 3), m, with ``names`` and ``sd`` or ``covariance`` (3n, 3n); an ``estimate.json`` will do, too."""
-    try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(str(path), "a marker layout (JSON)", "no such file") from None
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise InputError(str(path), "a marker layout (JSON)", str(error)) from None
-    if isinstance(record, Mapping) and isinstance(record.get("layout"), Mapping):
-        record = record["layout"]  # of an estimate
-    if not isinstance(record, Mapping) or "points" not in record:
-        raise InputError(str(path), "a marker layout with points", describe(record))
-    where = str(path)
-    points = np.array(
-        [convert(point, _Vector, f"{where}: points {k}") for k, point in enumerate(record["points"], 1)]
-    ).reshape(-1, 3)
-    if record.get("covariance") is None:
-        return _layout(points, {key: record[key] for key in ("names", "sd") if key in record}, where)
-    names = get(record, "names", tuple[str, ...], where)
-    try:
-        covariance = np.array(record["covariance"], dtype=float)
-    except (TypeError, ValueError):
-        raise InputError(f"{where}: covariance", "a matrix of numbers", "something else") from None
-    return MarkerLayout(names, points, covariance)
-
-
 def read_blob_source(
-    table: Mapping[str, Any], base_dir: Path, camera: Camera, layout: MarkerLayout | None
+    table: Mapping[str, Any], base_dir: Path, camera: Camera
 ) -> tuple[BlobRecording, tuple[str, ...]]:
     """[blobs]: from a table, or detected in images; with what a user should know about them."""
     where = "[blobs]"
@@ -231,9 +207,10 @@ def read_blob_source(
     if len(sources) != 1:
         raise InputError(where, "one of file, video and images", " and ".join(sources) or "none of them")
     if sources[0] != "file":
-        from factorgrasp.wrist_images import detect_blobs
+        from factorgrasp.vision.problem_table import blobs_from_table
 
-        return detect_blobs(table, base_dir, camera, layout)
+        blobs, remarks = blobs_from_table(table, base_dir, camera)
+        return blobs, (*remarks, *blob_remarks(blobs, camera))
     check_keys(table, ("file",), where)
     blobs = read_blobs(base_dir / get(table, "file", str, where), camera)
     return blobs, blob_remarks(blobs, camera)
@@ -248,10 +225,17 @@ def blob_remarks(blobs: BlobRecording, camera: Camera) -> tuple[str, ...]:
         )
     known = np.isfinite(blobs.depth)
     if not known.any():
-        out.append("no blob has a depth: two poses explain a nearly flat hand's pixels, and the answer may be ambiguous")
+        out.append(
+            "no blob has a depth: two poses explain a nearly flat hand's pixels, and the answer may be ambiguous"
+        )
     elif known.mean() < 0.5:
         out.append(f"only {100.0 * known.mean():.0f} % of the blobs have a depth")
     step = float(np.median(np.diff(blobs.t))) if len(blobs) > 1 else float("nan")
+    if np.isfinite(step) and not 0.02 < step * camera.rate < 50.0:
+        raise InputError(
+            f"{blobs.name}: t", f"seconds, about {1.0 / camera.rate:.3g} from frame to frame", f"steps of {step:.4g}",
+            "Milliseconds? Name the column 't [ms]'" if step * camera.rate > 1.0 else "",
+        )  # fmt: skip
     if np.isfinite(step) and not 0.5 < step * camera.rate < 2.0:
         out.append(
             f"frames come every {1e3 * step:.3g} ms, and [camera] rate says {1e3 / camera.rate:.3g} ms: is the column t in seconds?"
@@ -259,11 +243,22 @@ def blob_remarks(blobs: BlobRecording, camera: Camera) -> tuple[str, ...]:
     return tuple(out)
 
 
-def _layout_from(
-    blobs: BlobRecording, camera: Camera, table: Mapping[str, Any], noise: WristNoise
+def _calibrated(
+    blobs: BlobRecording, camera: Camera, hand: Hand, facing: Facing, names: tuple[str, ...] | None
 ) -> tuple[MarkerLayout, tuple[str, ...]]:
-    """The layout of ``layout = "estimate"``: from the first frames' points with depth."""
-    raise NotImplementedError
+    """The layout of ``layout = "estimate"``: from the first frames that show all markers with depth."""
+    from factorgrasp.palm_calibration import calibrate_palm
+
+    found = calibrate_palm(blobs, camera, hand, facing)
+    layout = found.layout
+    if names is not None:
+        if len(names) != len(layout):
+            raise InputError("[markers] names", f"{len(layout)} names, one a marker", f"{len(names)}")
+        layout = MarkerLayout(names, layout.points, layout.covariance)
+    sd = 1e3 * float(np.sqrt(np.mean(layout.sd**2)))
+    return layout, (
+        f"the layout was calibrated from {found.frames.size} frames, to {sd:.2f} mm a coordinate",
+    )
 
 
 def _association(table: Mapping[str, Any]) -> WristAssociation:

@@ -206,30 +206,40 @@ class WristResult:
         ]
         if self.message:
             lines.append(self.message)
-        for one in self.measures.range_of_motion:
-            up, down = one.directions
-            lines.append(
-                f"  {one.axis.replace('_', '/', 1).replace('_', ' '):<24}{np.degrees(one.range.value):6.1f} deg +- {np.degrees(one.range.sd):.1f}"
-                f"   ({up.replace('_', ' ')} {np.degrees(one.maximum.value):.1f}, {down.replace('_', ' ')} {np.degrees(-one.minimum.value):.1f}"
-                f"; {one.cycles} cycle{'' if one.cycles == 1 else 's'})"
+        # What an answer that is none says of the hand is not for printing.
+        for one in self.measures.range_of_motion if self.status.ok else ():
+            (up, most), (down, least) = zip(
+                one.directions, (one.maximum.value, -one.minimum.value), strict=True
             )
-        for move in self.measures.movements:
+            axis, cycles = (
+                one.axis.replace("_", "/", 1).replace("_", " "),
+                "cycle" if one.cycles == 1 else "cycles",
+            )
             lines.append(
-                f"  movement {move.start:6.2f} to {move.end:.2f} s: {quantity(move.distance.value, 'm', 3)} +- {quantity(move.distance.sd, 'm')}, "
-                f"peak {significant(move.peak_speed.value, 3)} m/s, straightness {move.straightness.value:.3f}"
+                f"  {axis:<24}{np.degrees(one.range.value):6.1f} deg +- {np.degrees(one.range.sd):.1f}   ({up.replace('_', ' ')} "
+                f"{np.degrees(most):.1f}, {down.replace('_', ' ')} {np.degrees(least):.1f}; {one.cycles} {cycles})"
+            )
+        for move in self.measures.movements if self.status.ok else ():
+            way = f"{quantity(move.distance.value, 'm', 3)} +- {quantity(move.distance.sd, 'm')}"
+            lines.append(
+                f"  movement {move.start:6.2f} to {move.end:.2f} s: {way}, peak {significant(move.peak_speed.value, 3)} m/s, "
+                f"straightness {move.straightness.value:.3f}"
             )
         sd = self._typical_sd()
         if np.isfinite(sd[0]):
             lines.append(f"  typical sd {np.degrees(sd[0]):.2f} deg, {1e3 * sd[1]:.2f} mm")
         lines.append(
-            f"  a marker is missed {100.0 * (1.0 - self.solved.detection):.1f} % of the time; {self.solved.clutter:.2f} blobs a frame are none"
+            f"  a marker is missed {100.0 * (1.0 - self.solved.detection):.1f} % of the time; "
+            f"{self.solved.clutter:.2f} blobs a frame are none"
         )
         for gap in track.gaps:
             end = "the track was lost" if gap.lost else "bridged"
             if gap.found is not None and gap.lost:
                 end += f" and found again at {gap.found:.2f} s"
             if gap.frames > 2:
-                lines.append(f"  no marker from {gap.start:.2f} to {gap.end:.2f} s ({gap.frames} frames): {end}")
+                lines.append(
+                    f"  no marker from {gap.start:.2f} to {gap.end:.2f} s ({gap.frames} frames): {end}"
+                )
         lines += [f"note: {words}" for words in self.warnings]
         return "\n".join(lines)
 

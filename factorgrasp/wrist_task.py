@@ -10,28 +10,34 @@ import numpy as np
 
 from factorgrasp.errors import NotSolvedError
 from factorgrasp.estimate import Estimate
-from factorgrasp.kinematics.angles import Hand
+from factorgrasp.kinematics.angles import Facing, Hand
 from factorgrasp.kinematics.wrist_measures import wrist_measures
 from factorgrasp.least_squares import LeastSquares
 from factorgrasp.models.camera import Camera
 from factorgrasp.models.markers import MarkerLayout
-from factorgrasp.problems.wrist_estimate import WristPoseEstimate, find_gaps, lost_frames, make_track
-from factorgrasp.problems.wrist_frames import StartFrame
-from factorgrasp.problems.wrist_model import Pairs, blob_covariances, roots
-from factorgrasp.problems.wrist_pose import FirstPass, WristPose, track_forward
+from factorgrasp.problems.wrist_estimate import (
+    WristPoseEstimate,
+    find_gaps,
+    first_frames,
+    lost_frames,
+    make_track,
+)
+from factorgrasp.problems.wrist_pose import WristPose, track_forward
 from factorgrasp.problems.wrist_settings import WristAssociation, WristNoise, WristSettings
 from factorgrasp.problems.wrist_track import CameraPose, WristTrack
-from factorgrasp.problems.wrist_tracker import Node
 from factorgrasp.provenance import versions
 from factorgrasp.recordings.blobs import BlobRecording
 from factorgrasp.status import Status
 from factorgrasp.typing import FloatArray, State
+from factorgrasp.wrist_checks import riding_blobs, riding_words, seen_from_behind
 from factorgrasp.wrist_result import WristResult
 
 MOST_AMBIGUOUS = 0.2
 """Share of the frames that may be ambiguous before the answer as a whole is."""
 LEAST_FOUND = 0.5
 """Share of the frames in which the hand has to be found."""
+LEAST_DETECTION = 0.6
+"""Share of the markers that have to be seen for an answer about which there are doubts."""
 
 
 class WristTask:
@@ -47,6 +53,8 @@ class WristTask:
     method : {"batch", "fixed_lag", "filter"}
         Smoothed over the whole recording; or each frame as it is known `settings.lag` frames later, or at once.
     hand : {"right", "left"}
+    facing : {"back", "palm"}
+        The side of the hand that bears the markers.
     remarks : sequence of str
         What the reader of the recording noticed.
     """
@@ -65,10 +73,11 @@ class WristTask:
         camera_pose: CameraPose | None = None,
         method: Literal["batch", "fixed_lag", "filter"] = "batch",
         hand: Hand = "right",
+        facing: Facing = "back",
         remarks: tuple[str, ...] = (),
     ) -> None:
         self.problem = WristPose(camera, blobs, markers, association, noise, settings, camera_pose)
-        self.method, self.hand, self.remarks = method, hand, tuple(remarks)
+        self.method, self.hand, self.facing, self.remarks = method, hand, facing, tuple(remarks)
 
     def solve(self, solver: str | None = None) -> WristResult:
         """Track, smooth and measure.
@@ -86,15 +95,19 @@ class WristTask:
         from factorgrasp.solvers.solve import solve
 
         try:
-            if self.method == "batch":
-                solved = cast(WristPoseEstimate, solve(self.problem, solver))
-            else:
-                solved = self._forward()
+            solved = (
+                cast(WristPoseEstimate, solve(self.problem, solver))
+                if self.method == "batch"
+                else self._forward()
+            )
         except NotSolvedError as error:
             solved = self._nothing(str(error))
-        measures = wrist_measures(solved.track, self.hand)
-        warnings = [*self.remarks, *solved.warnings, *seen_from_behind(solved.track), *measures.words]
-        status, message = self._judged(solved)
+        measures = wrist_measures(solved.track, self.hand, self.facing)
+        track = solved.track
+        riding = riding_blobs(track, self.problem.blobs, self.problem.camera)
+        doubts = (*seen_from_behind(track), *riding_words(riding))
+        status, message = self._judged(solved, doubts)
+        warnings = [*self.remarks, *solved.warnings, *doubts, *measures.words]
         estimate = replace(solved.estimate, status=status, message=message)
         return WristResult(
             estimate,
@@ -144,7 +157,12 @@ class WristTask:
         problem = self.problem
         started = time.perf_counter()
         first, newest = track_forward(
-            problem.camera, problem.blobs, problem.markers, problem.association, problem.noise, problem.settings
+            problem.camera,
+            problem.blobs,
+            problem.markers,
+            problem.association,
+            problem.noise,
+            problem.settings,
         )
         elapsed = time.perf_counter() - started
         problem.__dict__["first_pass"] = first
@@ -154,7 +172,7 @@ class WristTask:
         used = np.array([node.used for node in newest])
         gaps = find_gaps(problem.blobs.t, used, problem.association.lost_after)
         markers = MarkerLayout(problem.markers.names, first.layout, problem.markers.covariance)
-        start = problem.camera_pose or self._start_frame(first, first.nodes, markers)
+        start = problem.camera_pose or first_frames(problem, first.nodes, markers)
         track = make_track(
             nodes,
             start,
@@ -171,31 +189,6 @@ class WristTask:
             estimate, track, first.detection, first.clutter, nan, nan, float(densities[0]), float(densities[1]), nan, nan
         )  # fmt: skip
 
-    def _start_frame(self, first: FirstPass, nodes: tuple[Node, ...], markers: MarkerLayout) -> CameraPose:
-        problem = self.problem
-        blobs = problem.blobs
-        start = StartFrame(
-            problem.camera, markers.points, markers.covariance, problem.settings.start_frames
-        )
-        usual = float(np.nanmedian(blobs.depth)) if np.isfinite(blobs.depth).any() else 0.8
-        C = blob_covariances(
-            problem.camera, problem.noise, blobs.depth, usual, blobs.covariance_uv, blobs.covariance_depth
-        )
-        for k, node in enumerate(nodes):
-            rows = np.arange(len(blobs.frame))[blobs.rows(k)]
-            rows = rows[first.marker[rows] > 0]
-            if not node.used or rows.size < 3:
-                continue
-            uvz = np.nan_to_num(np.concatenate([blobs.uv[rows], blobs.depth[rows, None]], axis=1))
-            zeros = np.zeros(rows.size, dtype=np.intp)
-            pairs = Pairs(zeros, first.marker[rows] - 1, uvz, roots(C[rows]), C[rows])
-            start.add(float(blobs.t[k]), pairs, node.R, node.x[:3])
-            if start.closed:
-                break
-        if start.pose is None:
-            raise NotSolvedError("no frame shows three markers at once: the start posture is not known")
-        return start.pose
-
     # ---- what came of it
 
     def _estimate(self, status: Status, message: str, solver: str, timing: dict[str, float]) -> Estimate:
@@ -210,16 +203,18 @@ class WristTask:
         unknown = np.full((n, 6, 6), np.inf)
         no = np.zeros(n, dtype=bool)
         nowhere = CameraPose(np.full((3, 3), np.nan), np.full(3, np.nan), np.full((6, 6), np.nan))
+        nothing = np.full((n, 3), np.nan)
+        nobody = np.zeros(problem.blobs.frame.size, dtype=np.intp)
         track = WristTrack(
-            problem.blobs.t, np.full((n, 4), np.nan), *(np.full((n, 3), np.nan) for _ in range(3)), unknown, unknown.copy(),
-            np.zeros(problem.blobs.frame.size, dtype=np.intp), ~no, no, (), problem.markers, nowhere,
+            problem.blobs.t, np.full((n, 4), np.nan), nothing, nothing, nothing, unknown, unknown, nobody, ~no, no, (),
+            problem.markers, nowhere,
         )  # fmt: skip
         estimate = self._estimate(Status.UNOBSERVABLE, reason, "tracker", {})
         nan = float("nan")
         clutter = problem.blobs.frame.size / max(n, 1)
         return WristPoseEstimate(estimate, track, 0.0, clutter, nan, nan, nan, nan, nan, nan)
 
-    def _judged(self, solved: WristPoseEstimate) -> tuple[Status, str]:
+    def _judged(self, solved: WristPoseEstimate, doubts: tuple[str, ...]) -> tuple[Status, str]:
         """Whether the track as a whole answers the question."""
         status, message = solved.estimate.status, solved.estimate.message
         track = solved.track
@@ -234,20 +229,12 @@ class WristTask:
         found = 1.0 - float(np.mean(track.lost))
         if found < LEAST_FOUND:
             return Status.UNOBSERVABLE, (
-                f"the hand was found in {100.0 * found:.0f} % of the frames only; check the layout, the units of the depth and the intrinsics"
+                f"the hand was found in {100.0 * found:.0f} % of the frames only; check the layout, the units of the depth and the "
+                "intrinsics"
+            )
+        if doubts and solved.detection < LEAST_DETECTION:
+            return Status.INFEASIBLE, (
+                f"no motion of this layout explains the blobs: only {100.0 * solved.detection:.0f} % of its markers are seen, and "
+                f"{doubts[-1]} Are the intrinsics right?"
             )
         return status, message
-
-
-def seen_from_behind(track: WristTrack) -> tuple[str, ...]:
-    """A word when the markers are on the far side of the hand, which no camera can see."""
-    seen = ~track.lost
-    if not seen.any():
-        return ()
-    towards = np.einsum("ni,ni->n", track.camera_rotation[seen][:, :, 2], track.camera_position[seen])
-    if np.mean(towards > 0.0) < 0.5:
-        return ()
-    return (
-        "the markers are on the side of the hand that the camera cannot see: are the columns u and v swapped, or is the layout that of "
-        "the other hand, or its z axis not out of the back of the hand?",
-    )

@@ -21,6 +21,8 @@ from factorgrasp.lie import so3_exp
 from factorgrasp.typing import FloatArray
 
 Hand: TypeAlias = Literal["right", "left"]
+Facing: TypeAlias = Literal["back", "palm"]
+"""The side of the hand out of which z of ``W`` points: that which bears the markers."""
 
 ISB_NAMES = ("flexion", "ulnar_deviation", "pronation")
 """What is positive in :func:`isb_angles`."""
@@ -68,20 +70,23 @@ def wrist_rotation(angles: npt.ArrayLike) -> FloatArray:
     return out
 
 
-def isb_signs(hand: Hand) -> FloatArray:
+def isb_signs(hand: Hand, facing: Facing = "back") -> FloatArray:
     """Factors (3,) from :func:`wrist_angles` to flexion, ulnar deviation and pronation of this hand.
 
     Raises
     ------
     InputError
-        For a hand that is neither "right" nor "left".
+        For a hand that is neither "right" nor "left", or a side of it that is neither "back" nor "palm".
     """
     if hand not in _SIGNS:
         raise InputError("hand", "'right' or 'left'", repr(hand))
-    return np.array(_SIGNS[hand])
+    if facing not in ("back", "palm"):
+        raise InputError("facing", "'back' or 'palm'", repr(facing))
+    # With z out of the palm, y and z are turned round, and x is not.
+    return np.array(_SIGNS[hand]) * ((1.0, 1.0, 1.0) if facing == "back" else (-1.0, -1.0, 1.0))
 
 
-def isb_angles(rotation: npt.ArrayLike, hand: Hand = "right") -> FloatArray:
+def isb_angles(rotation: npt.ArrayLike, hand: Hand = "right", facing: Facing = "back") -> FloatArray:
     """Flexion, ulnar deviation, pronation (rad), positive in the direction of their names: shape (..., 3).
 
     Parameters
@@ -89,8 +94,10 @@ def isb_angles(rotation: npt.ArrayLike, hand: Hand = "right") -> FloatArray:
     rotation : array_like, shape (..., 3, 3)
         ``R_W0_W``.
     hand : {"right", "left"}
+    facing : {"back", "palm"}
+        The side of the hand out of which z of ``W`` points.
     """
-    return isb_signs(hand) * wrist_angles(rotation)
+    return isb_signs(hand, facing) * wrist_angles(rotation)
 
 
 def angle_jacobian(rotation: npt.ArrayLike) -> FloatArray:

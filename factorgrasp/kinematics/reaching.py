@@ -183,9 +183,11 @@ def _movement(
 ) -> Movement | None:
     found = [_describe(clock, p[k], slow[k], peak, onset, rate) for k in range(len(p))]
     own = found[0]
-    if own is None or own["distance"] < smallest:
+    if own is None or not own["distance"] >= smallest:
         return None
     rows = [one for one in found[1:] if one is not None]
+    if len(rows) < 0.5 * (len(found) - 1):
+        return None  # the track is too uncertain to say that this is a movement
     drawn = {name: np.array([one[name] for one in rows]) for name in own}
     measures = {
         name: _debiased(own[name], drawn[name], unit) for name, unit in _UNITS.items() if name != "ldlj"

@@ -11,6 +11,7 @@ from factorgrasp.kinematics.angles import (
     AXES,
     ISB_NAMES,
     OPPOSITES,
+    Facing,
     Hand,
     angle_covariance,
     isb_signs,
@@ -70,7 +71,11 @@ class WristMeasures:
 
 
 def wrist_measures(
-    track: WristTrack, hand: Hand = "right", samples: int = SAMPLES, seed: int = 0
+    track: WristTrack,
+    hand: Hand = "right",
+    facing: Facing = "back",
+    samples: int = SAMPLES,
+    seed: int = 0,
 ) -> WristMeasures:
     """Measures of a track; smoothed ones only, for a filter's noise makes ranges of motion 2 to 3 degrees too large.
 
@@ -79,14 +84,22 @@ def wrist_measures(
     track : WristTrack
     hand : {"right", "left"}
         Decides the signs of deviation and pronation.
+    facing : {"back", "palm"}
+        The side of the hand out of which z of ``W`` points.
     samples : int
         Tracks that are drawn for the standard deviations.
     seed : int
         Of the draws: the same track gives the same numbers.
     """
-    R = track.rotation
-    P = np.where(np.isfinite(track.covariance), track.covariance, np.nan)
-    signs = isb_signs(hand)
+    # A pose of a frame without a measurement is a guess, and no measure may rest on it.
+    unknown_pose = track.lost[:, None, None]
+    R = np.where(unknown_pose, np.nan, track.rotation)
+    P = np.where(unknown_pose | ~np.isfinite(track.covariance), np.nan, track.covariance)
+    position, velocity, rate = (
+        np.where(track.lost[:, None], np.nan, values)
+        for values in (track.position, track.velocity, track.angular_velocity)
+    )
+    signs = isb_signs(hand, facing)
     angles = signs * wrist_angles(R)
     variance = np.einsum("nii->ni", angle_covariance(R, P[:, :3, :3]))
     sd = np.sqrt(np.maximum(variance, 0.0))
@@ -101,8 +114,7 @@ def wrist_measures(
             "the track is not smoothed over the whole recording: its noise makes ranges of motion too large"
         )
     drawn = sample_tracks(
-        track.t, R, track.position, track.velocity, track.angular_velocity, P, track.velocity_covariance,
-        samples, seed,
+        track.t, R, position, velocity, rate, P, track.velocity_covariance, samples, seed,
     )  # fmt: skip
     drawn_angles = signs * wrist_angles(drawn.rotation)
     ranges = tuple(
@@ -116,9 +128,9 @@ def wrist_measures(
         angles,
         sd,
         ranges,
-        _peak(track.t, track.angular_velocity, drawn.angular_velocity, "rad/s"),
-        _peak(track.t, track.velocity, drawn.velocity, "m/s"),
-        movements(track.t, track.position, track.velocity, drawn.position, drawn.velocity),
+        _peak(track.t, rate, drawn.angular_velocity, "rad/s"),
+        _peak(track.t, velocity, drawn.velocity, "m/s"),
+        movements(track.t, position, velocity, drawn.position, drawn.velocity),
         tuple(words),
     )
 

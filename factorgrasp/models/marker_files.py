@@ -26,7 +26,7 @@ def write_layout(path: str | Path, layout: MarkerLayout, **more: Any) -> Path:
 
 
 def read_layout(path: str | Path) -> MarkerLayout:
-    """A layout that :func:`write_layout` wrote.
+    """A layout that :func:`write_layout` wrote, or that of the ``estimate.json`` of a wrist recording.
 
     Raises
     ------
@@ -36,6 +36,7 @@ def read_layout(path: str | Path) -> MarkerLayout:
     file = Path(path)
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
+        content = content.get("layout", content)
         names, points = tuple(content["names"]), np.array(content["points"], dtype=float)
         covariance = np.array(content.get("covariance", []), dtype=float)
     except FileNotFoundError:

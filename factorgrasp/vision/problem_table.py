@@ -6,7 +6,8 @@
     video = "wrist.avi"              # or images = "rgb/"
     depth = "depth/"                 # 16-bit PNGs, one a frame
     depth_scale = 0.001              # m a step
-    click = [312, 208]               # a pixel of the first frame on a marker; or colour = "blue.json"; neither: proposed
+    click = [312, 208]               # a pixel of the first frame on a marker; or patch = [u0, v0, u1, v1], or colour = "blue.json";
+                                     # none of them: proposed
     marker_diameter = 0.012          # and every other setting of the detector
 """
 
@@ -26,7 +27,7 @@ from factorgrasp.vision.frames import read_frames
 from factorgrasp.vision.recording import detect_recording, propose_detector
 from factorgrasp.vision.settings import DetectorSettings
 
-SOURCE_KEYS = ("video", "images", "depth", "depth_scale", "rate", "colour", "click")
+SOURCE_KEYS = ("video", "images", "depth", "depth_scale", "rate", "colour", "click", "patch")
 
 
 def blobs_from_table(
@@ -48,21 +49,32 @@ def blobs_from_table(
         return None if value is None else base_dir / value
 
     rate = get(table, "rate", float, where, None)
-    frames = read_frames(
-        video=path("video"),
-        images=path("images"),
-        depth=path("depth"),
-        depth_scale=get(table, "depth_scale", float, where, 1e-3),
-        rate=rate or camera.rate,
-    )
+    try:
+        frames = read_frames(
+            video=path("video"),
+            images=path("images"),
+            depth=path("depth"),
+            depth_scale=get(table, "depth_scale", float, where, 1e-3),
+            rate=rate or camera.rate,
+        )
+    except InputError as error:
+        if error.field.startswith(where):
+            raise
+        raise InputError(f"{where} {error.field}", error.expected, error.found, error.hint) from error
     colour, click = path("colour"), get(table, "click", tuple[float, float], where, None)
-    if colour is not None and click is not None:
-        raise InputError(f"{where} click", "either this or colour", "both")
+    patch = get(table, "patch", tuple[int, int, int, int], where, None)
+    given = [key for key in ("click", "patch", "colour") if key in table]
+    if len(given) > 1:
+        raise InputError(where, "one of click, patch and colour", " and ".join(given))
     remarks = []
     if colour is not None:
         detector = BlobDetector(read_colour(colour), settings, camera)
-    elif click is not None:
-        detector = BlobDetector(learn_colour(next(iter(frames)).rgb, click=click), settings, camera)
+    elif given:
+        try:
+            reference = learn_colour(next(iter(frames)).rgb, click=click, patch=patch)
+        except InputError as error:
+            raise InputError(f"{where} {given[0]}", error.expected, error.found, error.hint) from error
+        detector = BlobDetector(reference, settings, camera)
     else:
         detector = propose_detector(frames, camera, settings)
         remarks.append("the markers' colour was proposed from the first frames: no click or colour was given")
