@@ -219,10 +219,8 @@ class Excitation:
             path = {(k, float(time)) for k in range(len(space.path_bounds)) for time in times}
         return Points(frozenset(), frozenset(path), windows)
 
-    def program(
-        self, space: PlanSpace, points: Points, start: FloatArray, share: tuple[float, float] = (1.0, 1.0), share_weight: float = 0.0
-    ) -> TrajectoryProgram:
-        """The nonlinear program with limits at `points`; `share` below one lets the excitation fall short, at a price."""
+    def program(self, space: PlanSpace, points: Points, start: FloatArray) -> TrajectoryProgram:
+        """The nonlinear program with limits at `points`."""
         limits = []
         for index, time in sorted(points.coordinates):
             bound = space.coordinate_bounds[index]
@@ -241,7 +239,7 @@ class Excitation:
         scale = self.energy_scale
         return TrajectoryProgram(
             space.motion, self.nodes, space.integrand, self.node_weights / (self.settings.duration * scale),
-            self._windows(points), limits, space.path, path_limits, space.fixed, start, share, share_weight, space.reach,
+            self._windows(points), limits, space.path, path_limits, space.fixed, start, space.reach,
         )  # fmt: skip
 
     def start(self, seed: int | None = None) -> FloatArray:
@@ -301,7 +299,11 @@ class Excitation:
             self._grid_values[order] = self.basis.values(self.grid, order)
         return np.asarray(C @ self._grid_values[order] + space.motion.offset(self.grid)[order])
 
-    def check(self, space: PlanSpace, C: FloatArray, points: Points) -> PlanCheck:
+    def eased(self, points: Points, share: float) -> Points:
+        """The same limits with `share` of the demand."""
+        return replace(points, tighter=points.tighter * share)
+
+    def check(self, space: PlanSpace, C: FloatArray, points: Points, needed: float = 1.0) -> PlanCheck:
         """All limits and all windows on the fine grid, and where the program has to be held tighter."""
         t = self.grid
         z = np.concatenate([self.on_grid(space, C, order) for order in range(3)])
@@ -321,11 +323,11 @@ class Excitation:
                 path |= {(index, float(t[k])) for k in worst}
         starts, shares = self._grid_windows(space, z, given)
         windows, tighter = set(points.windows), points.tighter
-        if np.min(shares) < 1.0:
+        if np.min(shares) < needed:
             worst_start = float(starts[int(np.argmin(shares))])
             near = {int(np.clip(k, 0, self._panels - self._window_panels)) for k in (np.floor(worst_start / self.panel), np.ceil(worst_start / self.panel))}
             if near <= windows:
-                tighter *= (1.0 + 5e-4) / float(np.min(shares))
+                tighter *= (1.0 + 5e-4) * needed / max(float(np.min(shares)), 0.5 * needed)
             windows |= near
         return PlanCheck(
             tuple(margins), starts, shares, Points(frozenset(coordinates), frozenset(path), frozenset(windows), tighter)

@@ -1,10 +1,10 @@
 """A motion in a basis as a nonlinear program: an integral to minimise, integrals over windows to keep, limits at instants.
 
-Unknowns are the coefficients C (m, functions) of m coordinates ``x(t) = offset(t) + C b(t)``, the Cholesky factors of the excitation beyond
-what is asked for, and the share of the excitation that is reached:
+Unknowns are the coefficients C (m, functions) of m coordinates ``x(t) = offset(t) + C b(t)``, and the Cholesky factors of the excitation beyond
+what is asked for:
 
-    minimise   1/T integral s_0(z, p) dt - weight share
-    subject to Psi(integral over window w of s(z, p) dt) = share I + L_w L_w'      (or >= share, entry by entry)
+    minimise   1/T integral s_0(z, p) dt
+    subject to Psi(integral over window w of s(z, p) dt) = I + L_w L_w'      (or >= 1, entry by entry)
                low <= h(z, p) <= high at chosen instants,  low <= a derivative of a coordinate <= high at chosen instants,
                rest at the ends
 
@@ -113,15 +113,15 @@ def triangle(size: int) -> list[tuple[int, int]]:
 
 
 def _cholesky_function(size: int) -> NodeFunction:
-    """``[L, share] -> triangle of share I + L L'``, L lower with its entries row by row of L'."""
+    """``L -> triangle of I + L L'``, L lower with its entries row by row of L'."""
     import casadi as ca
 
     where = triangle(size)
-    y = ca.SX.sym("y", len(where) + 1)
+    y = ca.SX.sym("y", len(where))
     L = ca.SX(size, size)
     for k, (i, j) in enumerate(where):
         L[j, i] = y[k]
-    S = L @ L.T + y[len(where)] * ca.DM.eye(size)
+    S = L @ L.T + ca.DM.eye(size)
     return NodeFunction("cholesky", y, ca.SX.sym("p", 0), ca.vertcat(*[S[i, j] for i, j in where]))
 
 
@@ -144,10 +144,6 @@ class TrajectoryProgram:
         Conditions ``C b^(order)(time) = target`` (coordinates,).
     start : (coordinates, functions) ndarray
         Coefficients.
-    share : (low, high)
-        Bounds of the share of the excitation that has to be reached; both one to demand it.
-    share_weight : float
-        Of minus the share in the objective.
     reach : float
         Bound of every coefficient: none of a motion that stays within half of it is larger, and no iterate can run away.
     """
@@ -164,8 +160,6 @@ class TrajectoryProgram:
         path_limits: Sequence[PathLimit] = (),
         fixed: Sequence[tuple[float, int, FloatArray]] = (),
         start: FloatArray | None = None,
-        share: tuple[float, float] = (1.0, 1.0),
-        share_weight: float = 0.0,
         reach: float = np.inf,
     ) -> None:
         self.motion, self.t, self._s, self._weights, self.windows = motion, t, integrand, weights, windows
@@ -173,7 +167,7 @@ class TrajectoryProgram:
         self._m, self._nb, self._nc = m, nb, m * nb
         self._B = np.stack([motion.basis.values(t, d) for d in range(3)])
         self._offset, self._p = motion.offset(t)[:3], motion.given(t)
-        self.limits, self.path_limits, self._path = tuple(limits), tuple(path_limits), path
+        self._path = path
         self._aux: NodeFunction | None = None
         self._per_window, self._count = 0, 0
         if windows is not None:
@@ -184,14 +178,14 @@ class TrajectoryProgram:
                 self._aux = _cholesky_function(size)
                 self._per_window = windows.condition.size_out
         self._ny = self._per_window * self._count
-        self.size = self._nc + self._ny + 1
-        self._share_weight = share_weight
+        self.size = self._nc + self._ny
+        self.limits, self.path_limits = tuple(limits), tuple(path_limits)
         self._linear(fixed)
         self._instants()
-        self._bounds(share, reach)
+        self._bounds(reach)
         self._patterns()
         self._known: tuple[bytes, dict[str, FloatArray]] = (b"", {})
-        self.start = self.point(np.zeros((m, nb)) if start is None else start, share[1])
+        self.start = self.point(np.zeros((m, nb)) if start is None else start)
 
     # ---- construction ---------------------------------------------------------------------------------------------
 
@@ -234,29 +228,27 @@ class TrajectoryProgram:
         self._path_i = np.array([one.index for one in self.path_limits], dtype=int)
         self._path_scale = np.array([one.scale for one in self.path_limits])
 
-    def _bounds(self, share: tuple[float, float], reach: float) -> None:
+    def _bounds(self, reach: float) -> None:
         self.lower, self.upper = np.full(self.size, -np.inf), np.full(self.size, np.inf)
         self.lower[: self._nc], self.upper[: self._nc] = -reach, reach
-        self.lower[-1], self.upper[-1] = share
-        if self.windows is None:
-            self.lower[-1] = self.upper[-1] = share[1]
         window_rows = 0 if self.windows is None else self._count * self._rows_per_window
         matrix = self.windows is not None and self.windows.matrix
         path_low = np.array([one.lower / one.scale for one in self.path_limits])
         path_high = np.array([one.upper / one.scale for one in self.path_limits])
-        self.row_lower = np.concatenate([self._A_low, np.zeros(window_rows), path_low])
+        self.row_lower = np.concatenate([self._A_low, np.full(window_rows, 0.0 if matrix else 1.0), path_low])
         self.row_upper = np.concatenate(
             [self._A_high, np.zeros(window_rows) if matrix else np.full(window_rows, np.inf), path_high]
         )
 
+
     def _patterns(self) -> None:
-        nc, last = self._nc, self.size - 1
+        nc = self._nc
         rows, columns = [], []
         for w in range(self._count):
             for i in range(self._rows_per_window):
                 row = w * self._rows_per_window + i
                 first = nc + w * self._per_window
-                chosen = [*range(nc), *range(first, first + self._per_window), last]
+                chosen = [*range(nc), *range(first, first + self._per_window)]
                 rows += [row] * len(chosen)
                 columns += chosen
         self._window_at = (np.array(rows, dtype=int), np.array(columns, dtype=int))
@@ -275,8 +267,6 @@ class TrajectoryProgram:
             i, j = np.meshgrid(block, block, indexing="ij")
             h_rows.append(i.ravel())
             h_columns.append(j.ravel())
-        h_rows.append(np.array([last]))
-        h_columns.append(np.array([last]))
         self._H_order, self._H = _fixed_pattern(np.concatenate(h_rows), np.concatenate(h_columns), (self.size, self.size))  # fmt: skip
 
     # ---- the program ----------------------------------------------------------------------------------------------
@@ -285,10 +275,10 @@ class TrajectoryProgram:
         """C (coordinates, functions) of a point."""
         return x[: self._nc].reshape(self._m, self._nb)
 
-    def point(self, C: FloatArray, share: float = 1.0) -> FloatArray:
+    def point(self, C: FloatArray) -> FloatArray:
         """Unknowns of a motion, with Cholesky factors that fit it as well as they can."""
         x = np.zeros(self.size)
-        x[: self._nc], x[-1] = C.ravel(), share
+        x[: self._nc] = C.ravel()
         if self._aux is not None:
             size = int(round((np.sqrt(8 * self._per_window + 1) - 1) / 2))
             where = triangle(size)
@@ -296,7 +286,7 @@ class TrajectoryProgram:
                 G = np.zeros((size, size))
                 for k, (i, j) in enumerate(where):
                     G[i, j] = G[j, i] = value[k]
-                d, V = np.linalg.eigh(G - share * np.eye(size))
+                d, V = np.linalg.eigh(G - np.eye(size))
                 L = np.linalg.cholesky((V * np.maximum(d, 1e-3)) @ V.T)
                 first = self._nc + w * self._per_window
                 x[first : first + self._per_window] = [L[j, i] for i, j in where]
@@ -307,13 +297,12 @@ class TrajectoryProgram:
         return self._condition(x)
 
     def objective(self, x: FloatArray) -> float:
-        return float(self._weights @ self._values(x)[:, 0]) - self._share_weight * float(x[-1])
+        return float(self._weights @ self._values(x)[:, 0])
 
     def gradient(self, x: FloatArray) -> FloatArray:
         out = np.zeros(self.size)
         J = self._jacobians(x)[:, 0].reshape(-1, 3, self._m)
         out[: self._nc] = np.einsum("k,kdj,dbk->jb", self._weights, J, self._B, optimize=True).ravel()
-        out[-1] = -self._share_weight
         return out
 
     def rows(self, x: FloatArray) -> FloatArray:
@@ -322,8 +311,6 @@ class TrajectoryProgram:
             psi = self._condition(x)
             if self._aux is not None:
                 psi = psi - self._aux.values(self._factors(x), np.empty((0, self._count)))
-            else:
-                psi = psi - x[-1]
             parts.append(psi.ravel())
         if self.path_limits:
             h = self._path_values(x)
@@ -339,7 +326,7 @@ class TrajectoryProgram:
             if self._aux is not None:
                 of_y = -self._aux.jacobians(self._factors(x), np.empty((0, self._count)))
             else:
-                of_y = np.full((self._count, self._rows_per_window, 1), -1.0)
+                of_y = np.empty((self._count, self._rows_per_window, 0))
             parts.append(np.concatenate([dpsi, of_y], axis=2).ravel())
         if self.path_limits:
             J = self._path_jacobians(x)[self._path_k, self._path_i].reshape(-1, 3, self._m)
@@ -366,7 +353,7 @@ class TrajectoryProgram:
                 S = self._integral_jacobian(x)
                 extra += np.einsum("wia,wij,wjb->ab", S, curved, S, optimize=True)
             if self._aux is not None:
-                h = self._aux.hessians(self._factors(x), none, -y.T)[:, :-1, :-1]
+                h = self._aux.hessians(self._factors(x), none, -y.T)
                 blocks += [block.ravel() for block in h]
         else:
             n_w = 0
@@ -380,7 +367,7 @@ class TrajectoryProgram:
             z = self._z(C, self._path_offset, self._path_B)
             extra += _assembled(self._path.hessians(z, self._path_p, h_load), self._path_B)
         data = np.bincount(
-            self._H_order, weights=np.concatenate([extra.ravel(), *blocks, [0.0]]), minlength=self._H.nnz
+            self._H_order, weights=np.concatenate([extra.ravel(), *blocks]), minlength=self._H.nnz
         )
         return sp.csc_array((data, self._H.indices, self._H.indptr), self._H.shape)
 
@@ -442,9 +429,8 @@ class TrajectoryProgram:
         return self._cached(x, "condition", lambda: condition.values(self._integrals(x).T, none))
 
     def _factors(self, x: FloatArray) -> FloatArray:
-        """(per window + 1, windows)."""
-        y = x[self._nc : self._nc + self._ny].reshape(self._count, self._per_window)
-        return np.concatenate([y.T, np.full((1, self._count), x[-1])])
+        """(per window, windows)."""
+        return x[self._nc : self._nc + self._ny].reshape(self._count, self._per_window).T
 
     def _path_values(self, x: FloatArray) -> FloatArray:
         assert self._path is not None

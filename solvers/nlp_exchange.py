@@ -8,7 +8,7 @@ of every stretch that violates a limit becomes a row, and the program is solved 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -19,8 +19,12 @@ from factorgrasp.status import Status
 from factorgrasp.typing import FloatArray
 
 MOST_ROUNDS = 15
-SHARE_WEIGHT = 1e3
-"""Price of excitation that falls short, in units of the objective: far above what any sensible motion costs."""
+MOST_EASINGS = 8
+"""Shares of a demand that cannot be met that are tried."""
+CLOSE = 1.25
+"""Ratio of a share that is too large to one that is not at which the search ends."""
+QUICK = 60
+"""Iterations after which a share counts as too large."""
 LOADED = 1e-4
 """Multiplier, relative to the price of the excitation, above which a limit counts as one that binds."""
 
@@ -28,14 +32,16 @@ LOADED = 1e-4
 class ExchangeProblem(Protocol):
     """What is solved so; `space` and `points` are the problem's own."""
 
-    def program(
-        self, space: Any, points: Any, start: FloatArray, share: tuple[float, float] = ..., share_weight: float = ...
-    ) -> Any:
-        """The :class:`NonlinearProgram` with limits at `points`; its last unknown is the share of the demand that is met."""
+    def program(self, space: Any, points: Any, start: FloatArray) -> Any:
+        """The :class:`NonlinearProgram` with limits at `points`, and ``coefficients(x)`` of its points."""
         ...
 
-    def check(self, space: Any, C: FloatArray, points: Any) -> Any:
-        """What the fine grid shows: ``violated``, ``share`` (at least one when the demand is met) and the ``points`` of the next round."""
+    def eased(self, points: Any, share: float) -> Any:
+        """The same limits with a share of the demand."""
+        ...
+
+    def check(self, space: Any, C: FloatArray, points: Any, needed: float = ...) -> Any:
+        """What the fine grid shows: ``violated``, ``share`` (of the demand that is met) and the ``points`` of the next round."""
         ...
 
     def first_points(self, space: Any) -> Any:
@@ -53,13 +59,13 @@ class ExchangeResult:
         Coefficients.
     status : Status
     message : str
-    check : object
-        Of the fine grid, for `C`.
+    check, points : object
+        Of the fine grid, for `C`; and where limits are imposed.
     program : NonlinearProgram
         The last one.
     solution : NlpSolution
     share : float
-        Of what was asked for that is reached: one, or the most there is when it is infeasible.
+        Of what was asked for that is met: one, or less when it is infeasible.
     binding : tuple of str
         Limits that bind at the end, the hardest first.
     rounds, iterations : int
@@ -71,6 +77,7 @@ class ExchangeResult:
     status: Status
     message: str
     check: Any
+    points: Any
     program: NonlinearProgram
     solution: NlpSolution
     share: float
@@ -99,53 +106,65 @@ def solve_by_exchange(
         Where to begin; the problem's own first points by default.
     """
     began = time.perf_counter()
-    result = _rounds(problem, space, solver, start, points, began, demand=True)
-    if result.status.ok:
+    points = problem.first_points(space) if points is None else points
+    result = _rounds(problem, space, solver, start, points, began, 1.0)
+    if result.status.ok or result.status is Status.NUMERICAL_ERROR:
         return result
-    # Whether that is the solver's fault or the demand's: how much of it can be had within the limits?
-    most = _rounds(problem, space, solver, start, result.check.points, began, demand=False)
-    if most.status.ok and most.share >= 1.0 - 1e-6:
-        again = _rounds(problem, space, solver, most.C, most.check.points, began, demand=True)
-        return again if again.status.ok else result
-    return most
+    return _most(problem, space, solver, start, result, began)
+
+
+def _most(
+    problem: ExchangeProblem, space: Any, solver: NlpSolver, start: FloatArray, failed: ExchangeResult, began: float
+) -> ExchangeResult:
+    """The largest share of the demand that can be met, by bisection from below; the whole demand if it can be met from there."""
+    C, share = _within_limits(problem, space, start, failed.points)
+    best: ExchangeResult | None = None
+    low, high = 0.8 * share, 1.0
+    quick = type(solver)(replace(solver.options, max_iterations=QUICK))
+    for number in range(MOST_EASINGS):
+        if low <= 0.0 or high < CLOSE * low:
+            break
+        trial = low if number == 0 else min(4.0 * low, 1.0) if high >= 1.0 else float(np.sqrt(low * high))
+        found = _rounds(problem, space, quick, C, failed.points, began, trial, 5)
+        if found.status.ok:
+            best, C, low = found, found.C, trial
+            if trial >= 1.0:
+                return found
+        else:
+            high = trial
+    if best is None:
+        return replace(failed, share=low)
+    words = f"{low:.3g} of it can be had" + (f", less than {high:.3g}" if high < 1.0 else "")
+    return replace(best, status=Status.INFEASIBLE, share=low, message=words)
 
 
 def _rounds(
-    problem: ExchangeProblem, space: Any, solver: NlpSolver, start: FloatArray, points: Any, began: float, demand: bool
+    problem: ExchangeProblem, space: Any, solver: NlpSolver, start: FloatArray, points: Any, began: float, share: float,
+    most: int = MOST_ROUNDS,
 ) -> ExchangeResult:
-    points = problem.first_points(space) if points is None else points
-    share, price, C, iterations = (1.0, 1.0), 0.0, start, 0
-    if not demand:
-        # From inside, and never back to rest: where nothing moves, no direction promises any excitation.
-        C, inside = _within_limits(problem, space, start, points)
-        share, price = (0.5 * inside, 1.0), SHARE_WEIGHT
-    reached = 0.0
-    for number in range(1, MOST_ROUNDS + 1):
-        program = problem.program(space, points, C, share, price)
-        if not demand:
-            program.start = program.point(C, 0.9 * inside if number == 1 else reached)
+    C, iterations = start, 0
+    for number in range(1, most + 1):
+        program = problem.program(space, problem.eased(points, share), C)
         found = solver.solve_program(program)
         iterations += found.iterations
         if np.all(np.isfinite(found.x)):
             C = program.coefficients(found.x)
-        check = problem.check(space, C, points)
-        reached = float(found.x[-1])
-        needed = 1.0 if demand else reached
-        good = not check.violated and check.share >= needed * (1.0 - 1e-4 if not demand else 1.0)
+        check = problem.check(space, C, points, share)
         points = check.points
-        if good or not found.status.ok:
+        settled = not check.violated and check.share >= share
+        if settled or not found.status.ok:
             break
     status, message = found.status, found.message
-    if found.status.ok and not good:
+    if found.status.ok and not settled:
         status, message = Status.NOT_CONVERGED, f"limits still violated between the instants imposed after {number} rounds"
     return ExchangeResult(
-        C, status, message, check, program, found, reached if not demand else 1.0, _binding(program, found), number, iterations,
+        C, status, message, check, points, program, found, share, _binding(program, found), number, iterations,
         time.perf_counter() - began,
     )  # fmt: skip
 
 
 def _within_limits(problem: ExchangeProblem, space: Any, C: FloatArray, points: Any) -> tuple[FloatArray, float]:
-    """The same motion made so small that no limit is violated, and the share that it reaches."""
+    """The same motion made so small that no limit is violated, and the share of the demand that it meets."""
     for _ in range(40):
         check = problem.check(space, C, points)
         if not check.violated:
