@@ -37,6 +37,10 @@ scenarios: dict[str, Scenario] = {
         "factorgrasp.simulation.cehajic2015:cehajic2015",
         "grasp pose, rigid object, wrist at rest (Cehajic 2015, section V; options motion='exciting' | 'printed')",
     ),
+    "cehajic2015_loop": Scenario(
+        "factorgrasp.simulation.cehajic2015_loop:cehajic2015_loop",
+        "closed loop of Cehajic 2015: arm, impedance, wrist, estimator (options policy='receding' | 'velocity' | 'biased', arm)",
+    ),
     "grasp_regrasp": Scenario(
         "factorgrasp.simulation.cehajic2015:grasp_regrasp",
         "grasp pose as in cehajic2015, and the hand takes another grasp half way (default 10 deg, 70 mm)",
