@@ -190,7 +190,7 @@ def test_velocity_law_keeps_what_the_wrong_estimate_did() -> None:
     assert theirs.translation_error[-1] < 5e-3
     # With as good an estimate, the way that was gone before it came is kept for good.
     assert theirs.felt(6.0).rms_force > 2.0 * ours.felt(6.0).rms_force
-    assert paper.felt().peak_force > 50.0
+    assert paper.felt().peak_force > 20.0 * ours.felt().peak_force
 
 
 def test_amplitude_follows_the_covariance() -> None:
