@@ -237,4 +237,4 @@ def _draw(ax: Axes, scene: MotionScene, k: int, whole: MotionScene, title: str) 
     picture.view_init(elev=18, azim=-62)
     for which in (picture.xaxis, picture.yaxis, picture.zaxis):
         which.set_ticklabels([])
-    picture.set_title(title)
+    picture.set_title(title, y=0.93)
