@@ -137,8 +137,7 @@ def draw_convergence(runs: Mapping[str, GraspLoopResult], path: str | os.PathLik
         strict=True,
     ):
         _dress(ax, title, unit)
-    axes[0].legend(ncols=2, loc="upper right")
-    axes[2].set_xlabel("time (s)")
+    _label(axes[0], axes[2])
     _save(made, path)
 
 
@@ -152,6 +151,12 @@ def _dress(ax: Axes, title: str, unit: str) -> None:
     ax.set_yscale("log")
     ax.set_title(title)
     ax.set_ylabel(unit)
+
+
+@plots.styled
+def _label(first: Axes, last: Axes) -> None:
+    first.legend(ncols=3, loc="upper right")
+    last.set_xlabel("time (s)")
 
 
 def _save(made: Figure, path: str | os.PathLike[str]) -> None:

@@ -239,5 +239,5 @@ def test_bad_arguments() -> None:
         Impedance(mass=-1.0)
     with pytest.raises(InputError, match="above zero"):
         RecedingSettings(force=0.0)
-    with pytest.raises(InputError, match="translation_stiffness"):
+    with pytest.raises(InputError, match="force_stiffness"):
         WristStiffness(-3.0)
