@@ -58,6 +58,8 @@ class ExcitationEvaluationTask:
     translation : (3,) ndarray
         ``p_r_h``, m; zero by default. The excitation matrix does not depend on either; the predicted covariance does where the robot's own
         noise counts, and the wrench does.
+    known : (6, 6) ndarray, optional
+        Covariance of [rotation; translation] that is known before the motion, rad and m.
     noise, settings, prior
         Of the grasp estimator, :class:`factorgrasp.problems.GraspPose`; without ``settings.max_gap`` three missing stamps are
         bridged, and without ``settings.kinematics_bandwidth`` motion above 10 Hz counts as noise.
@@ -87,6 +89,7 @@ class ExcitationEvaluationTask:
         rotation: FloatArray | None = None,
         translation: FloatArray | None = None,
         *,
+        known: FloatArray | None = None,
         noise: GraspNoise | None = None,
         settings: GraspSettings | None = None,
         prior: GraspPrior | None = None,
@@ -102,6 +105,7 @@ class ExcitationEvaluationTask:
         self.prior, self.demands = prior or GraspPrior(), demands or Demands()
         self.rotation = np.eye(3) if rotation is None else np.asarray(rotation, dtype=float)
         self.translation = np.zeros(3) if translation is None else np.asarray(translation, dtype=float)
+        self.known = known
         self.gravity, self.wrist = checked_gravity(gravity), wrist or WristStiffness()
         self.reference: Reference = reference
         if isinstance(stream, JointStream) and (robot_model is None or frame is None):
@@ -126,6 +130,7 @@ class ExcitationEvaluationTask:
             self.prior,
             self.gravity,
             self.motion.contained,
+            self.known,
         )
 
     def solve(self, solver: str | None = None) -> ExcitationEvaluation:
@@ -215,7 +220,7 @@ def build_evaluation(table: Mapping[str, Any], base_dir: Path) -> ExcitationEval
         "[evaluate]",
     )
     reference = get(evaluate, "reference", Reference, "[evaluate]", "start")
-    rotation, translation = _grasp(sub_table(table, "grasp"))
+    rotation, translation, known = _grasp(sub_table(table, "grasp"))
     noise = from_table(GraspNoise, sub_table(table, "noise"), "[noise]")
     settings = from_table(GraspSettings, sub_table(table, "estimate"), "[estimate]")
     gravity = get(robot, "gravity", _Three, "[robot]", (0.0, 0.0, -9.80665))
@@ -237,6 +242,7 @@ def build_evaluation(table: Mapping[str, Any], base_dir: Path) -> ExcitationEval
         stream,
         rotation,
         translation,
+        known=known,
         noise=noise,
         settings=settings,
         prior=prior,
@@ -312,25 +318,30 @@ def _read_arrays(path: Path, check_units: bool) -> tuple[JointStream, FloatArray
     return stream, arrays.get("tau")
 
 
-def _grasp(table: Mapping[str, Any]) -> tuple[FloatArray, FloatArray]:
+def _grasp(table: Mapping[str, Any]) -> tuple[FloatArray, FloatArray, FloatArray | None]:
     where = "[grasp]"
-    check_keys(table, ("rotation_wxyz", "translation"), where)
+    check_keys(table, ("rotation_wxyz", "translation", "covariance"), where)
     q = np.array(get(table, "rotation_wxyz", _Four, where, (1.0, 0.0, 0.0, 0.0)))
     norm = float(np.linalg.norm(q))
     if abs(norm - 1.0) > 1e-2:
         raise InputError("[grasp] rotation_wxyz", "a unit quaternion [w, x, y, z]", f"norm {norm:.6g}")
-    return quaternion_wxyz_to_matrix(q / norm), np.array(
-        get(table, "translation", _Three, where, (0.0, 0.0, 0.0))
-    )
+    translation = np.array(get(table, "translation", _Three, where, (0.0, 0.0, 0.0)))
+    if "covariance" not in table:
+        return quaternion_wxyz_to_matrix(q / norm), translation, None
+    six = tuple[float, float, float, float, float, float]
+    P = np.array(convert(table["covariance"], tuple[six, six, six, six, six, six], "[grasp] covariance"))
+    if np.max(np.abs(P - P.T)) > 1e-9 * np.abs(P).max() or np.linalg.eigvalsh(P)[0] <= 0.0:
+        raise InputError("[grasp] covariance", "a symmetric, positive definite matrix (6, 6)", "another one")
+    return quaternion_wxyz_to_matrix(q / norm), translation, P
 
 
 def _wrist(table: Mapping[str, Any]) -> WristStiffness:
     where = "[human]"
-    check_keys(table, ("translation_stiffness", "rotation_stiffness"), where)
+    check_keys(table, ("force_stiffness", "moment_stiffness"), where)
     known = WristStiffness()
     return WristStiffness(
-        get(table, "translation_stiffness", float, where, known.translation),
-        get(table, "rotation_stiffness", float, where, known.rotation),
+        get(table, "force_stiffness", float, where, known.translation),
+        get(table, "moment_stiffness", float, where, known.rotation),
     )
 
 

@@ -118,6 +118,7 @@ def predict_grasp(
     prior: GraspPrior | None = None,
     gravity: FloatArray | tuple[float, float, float] = (0.0, 0.0, -9.80665),
     contained: Callable[[FloatArray], RobotNoise] | None = None,
+    known: FloatArray | None = None,
 ) -> GraspPrediction:
     """Covariance that :class:`~factorgrasp.problems.GraspPose` is going to state after a motion.
 
@@ -140,6 +141,8 @@ def predict_grasp(
     contained : callable, optional
         Spectral densities of the noise that the signals of `motion` themselves contain (a recorded motion), frequency (K,) in Hz to
         :class:`RobotNoise`; taken out of the moments. None: the motion is exact (a planned one).
+    known : (6, 6) ndarray, optional
+        Covariance of [rotation; translation] that is known before the motion, besides the prior, rad and m.
 
     Raises
     ------
@@ -188,6 +191,8 @@ def predict_grasp(
     state |= {"rotation": np.asarray(rotation), "translation": np.asarray(translation)}
     J_g, J_a = model.jacobians(state)
     own = np.diag(prior_precision(model, noise, prior))
+    if known is not None:
+        own[:6, :6] += np.linalg.inv(known)
     noise_g = _form(J_g, np.tensordot(w_g * windowing.dof, expected.gyro, 1)[None])[0]
     noise_a = _form(J_a, np.tensordot(w_a * windowing.dof, expected.accelerometer, 1)[None])[0]
     H = _form(J_g, Z_g) + _form(J_a, Z_a) + own
@@ -278,14 +283,14 @@ def _form(J: FloatArray, Z: FloatArray) -> FloatArray:
 
 
 def _sandwich(H: FloatArray, M: FloatArray, own: FloatArray) -> FloatArray:
-    """``H^-1 M H^-1``, but nowhere wider than the prior with the diagonal information `own`.
+    """``H^-1 M H^-1``, but nowhere wider than what is known beforehand, the information `own`.
 
     Where nothing excites, H is the prior's and noise in the regressor would make the sandwich wider than that.
     """
     bread = floored_inverse(H)
-    root = np.sqrt(np.diag(own))
-    values, vectors = np.linalg.eigh(root[:, None] * (bread @ M @ bread) * root)
-    half = vectors * np.sqrt(np.clip(values, 0.0, 1.0)) / root[:, None]
+    root = np.linalg.cholesky(own)
+    values, vectors = np.linalg.eigh(root.T @ (bread @ M @ bread) @ root)
+    half = np.linalg.solve(root.T, vectors * np.sqrt(np.clip(values, 0.0, 1.0)))
     return np.asarray(half @ half.T)
 
 

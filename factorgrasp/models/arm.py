@@ -16,8 +16,8 @@ GRASP_FRAME = "grasp"
 """The frame ``r`` that is added to the arm: between the fingers, x away from the robot and z up when the arm is as at its start."""
 
 _PANDA = "panda_description/urdf/panda.urdf"
-# The gripper holds the object's edge from above, 0.45 m in front of the robot.
-_PANDA_START = (0.0, -0.143, 0.0, -2.27, 0.0, 2.13, 0.785)
+# The gripper holds the object's edge from above, 0.4 m in front of the robot, elbow bent: there its wrist can turn about a far point.
+_PANDA_START = (0.0, -0.5, 0.0, -2.55, 0.0, 2.05, 0.785)
 _FROM_ABOVE = np.diag([1.0, -1.0, -1.0])
 
 
@@ -99,15 +99,16 @@ def panda_urdf() -> Path | None:
     return None
 
 
-def panda_arm(payload: float = 2.0, payload_size: tuple[float, float, float] = (1.0, 0.8, 0.02)) -> Arm:
+def panda_arm(payload: float = 1.0, payload_size: tuple[float, float, float] = (1.0, 0.8, 0.02)) -> Arm:
     """The Panda with an object in its gripper; see :func:`seven_axis_arm` for one without its URDF.
 
     Parameters
     ----------
     payload : float
-        kg, a plate held at its edge.
+        kg, the robot's share of a plate that is held at two edges (the paper's weighs 2 kg): where the human carries the other half, it
+        loads the arm as a body at the grip. Alone at one edge no arm of this class could hold it.
     payload_size : (3,) float
-        m, along x, y and z of the frame ``r``.
+        Of the whole plate, m, along x, y and z of the frame ``r``.
 
     Raises
     ------
@@ -129,7 +130,7 @@ def panda_arm(payload: float = 2.0, payload_size: tuple[float, float, float] = (
     return _finished("Panda", model, int(gripper.parentJoint), grip, payload, payload_size, _PANDA_START)
 
 
-def seven_axis_arm(payload: float = 2.0, payload_size: tuple[float, float, float] = (1.0, 0.8, 0.02)) -> Arm:
+def seven_axis_arm(payload: float = 1.0, payload_size: tuple[float, float, float] = (1.0, 0.8, 0.02)) -> Arm:
     """A plain seven-axis arm: links like a Panda's, of round masses; needs nothing but pinocchio."""
     import pinocchio
 
@@ -157,7 +158,7 @@ def seven_axis_arm(payload: float = 2.0, payload_size: tuple[float, float, float
     return _finished("arm", model, parent, grip, payload, payload_size, (0.0, -0.5, 0.0, 2.0, 0.0, -1.5, 0.0))
 
 
-def default_arm(payload: float = 2.0) -> Arm:
+def default_arm(payload: float = 1.0) -> Arm:
     """The Panda where it is installed, else :func:`seven_axis_arm`."""
     return seven_axis_arm(payload) if panda_urdf() is None else panda_arm(payload)
 

@@ -28,13 +28,13 @@ class WristStiffness:
     """
 
     translation: float = 300.0
-    rotation: float = 5.0
+    rotation: float = 2.0
 
     def __post_init__(self) -> None:
-        for name in ("translation", "rotation"):
+        for name, key in (("translation", "force"), ("rotation", "moment")):
             value = getattr(self, name)
             if not np.isfinite(value) or value < 0.0:
-                raise InputError(f"human.{name}_stiffness", "a finite number, zero or more", repr(value))
+                raise InputError(f"human.{key}_stiffness", "a finite number, zero or more", repr(value))
 
     def wrench(
         self,

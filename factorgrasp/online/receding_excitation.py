@@ -69,7 +69,9 @@ class RecedingSettings:
     stiffness : float
         N/m; what holds the end-effector and the wrist together (robot and wrist in series): the force is this times the displacement.
     angle, smallest_angle : float
-        rad; largest turn that the wrist and the robot bear, and the one that is tried while nothing is known.
+        rad; largest turn that the wrist and the robot bear, and the smallest that is worth while.
+    speed, acceleration : float
+        m/s, m/s^2; what the robot's end-effector may reach while it turns about the wrist.
     horizon : float
         s; in this time the target shall be reached, when the wrist allows it.
     period : float
@@ -82,10 +84,12 @@ class RecedingSettings:
 
     rotation_sd: float = float(np.deg2rad(0.05))
     translation_sd: float = 1.5e-3
-    force: float = 2.0
+    force: float = 3.0
     stiffness: float = 150.0
     angle: float = 0.12
     smallest_angle: float = 0.01
+    speed: float = 0.6
+    acceleration: float = 4.0
     horizon: float = 5.0
     period: float = 0.5
     confidence: float = 2.0
@@ -163,6 +167,8 @@ class RecedingExcitation:
         self._information = _information_per_square_angle(
             self.pattern, self._rotation, noise or GraspNoise(), estimation or GraspSettings()
         )
+        _, rate, change = self.pattern.derivatives(np.arange(0.0, _SAMPLE, 1.0 / _SAMPLE_RATE))
+        self._peaks = tuple(float(np.max(np.linalg.norm(x, axis=1))) for x in (rate, change))
         self._next = 0.0
         self.replans: list[Replan] = []
 
@@ -201,16 +207,21 @@ class RecedingExcitation:
             possible = (
                 min(possible, away + s.confidence * lever_sd) if not followed else s.confidence * lever_sd
             )
-        allowed = min(s.angle, s.force / (s.stiffness * max(possible, 1e-9)))
-        needed = self._needed(estimate) if known else s.smallest_angle
+        reach = float(np.linalg.norm(self._lever.target))
+        robot = min(
+            s.speed / max(self._peaks[0] * reach, 1e-9), s.acceleration / max(self._peaks[1] * reach, 1e-9)
+        )
+        largest = min(s.angle, robot)
+        allowed = min(largest, s.force / (s.stiffness * max(possible, 1e-9)))
+        needed = self._needed(estimate) if known else s.angle
         if needed == 0.0:
             angle, reason = 0.0, "target reached"
         elif needed <= allowed:
             angle, reason = needed, "as much as the target needs"
-        elif allowed < s.angle:
+        elif allowed < largest:
             angle, reason = allowed, "as much as the wrist bears with an error of the lever arm"
         else:
-            angle, reason = s.angle, "largest angle"
+            angle, reason = largest, "largest angle" if largest == s.angle else "as much as the robot can"
         if followed and angle > self.angle:
             # First the better reference, then more motion.
             angle, reason = self.angle, "lever arm first"

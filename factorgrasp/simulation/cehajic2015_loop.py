@@ -36,7 +36,8 @@ from factorgrasp.simulation.impedance import Impedance
 from factorgrasp.simulation.trajectory import Sinusoids
 from factorgrasp.typing import FloatArray
 
-PolicyName: TypeAlias = Literal["receding", "velocity", "biased", "fixed"]
+PolicyName: TypeAlias = Literal["receding", "velocity", "velocity_online", "biased", "fixed"]
+_POLICIES = ("receding", "velocity", "velocity_online", "biased", "fixed")
 
 NOISE = GraspNoise(
     gyro_density=XSENS.gyro_noise_density,
@@ -72,7 +73,7 @@ def cehajic2015_loop(
     pattern: Sinusoids | None = None,
     impedance: Impedance | None = None,
     imu: HandImu = XSENS,
-    time_offset: bool = False,
+    time_offset: bool = True,
     control: JointControl | None = None,
 ) -> GraspLoopResult:
     """The paper's set-up in closed loop.
@@ -81,9 +82,10 @@ def cehajic2015_loop(
     ----------
     seed : int
         Of all noise and biases; the same for every policy.
-    policy : {"receding", "velocity", "biased", "fixed"}
+    policy : {"receding", "velocity", "velocity_online", "biased", "fixed"}
         - receding: :class:`RecedingExcitation` with the online estimator, from the paper's wrong start;
         - velocity: the paper's procedure, its law (26) fed with its own moving estimate, under its printed motion;
+        - velocity_online: the law (26) alone, under the receding plan's pattern at 0.05 rad and fed with the online estimator's estimate;
         - biased: the law (26) with the lever arm kept at `lever` (``r_0`` by default), under the printed motion: Fig. 5;
         - fixed: a pose-level reference about a kept `lever`, under the printed motion.
     duration : float
@@ -112,8 +114,8 @@ def cehajic2015_loop(
     -------
     GraspLoopResult
     """
-    if policy not in ("receding", "velocity", "biased", "fixed"):
-        raise InputError("policy", "receding, velocity, biased or fixed", repr(policy))
+    if policy not in _POLICIES:
+        raise InputError("policy", "one of " + ", ".join(_POLICIES), repr(policy))
     rng = np.random.default_rng([seed, 5])
     truth = GraspTruth(
         quaternion_wxyz_to_matrix(QUATERNION_WXYZ),
@@ -127,16 +129,19 @@ def cehajic2015_loop(
     error = ORIENTATION_ERROR * axis / np.linalg.norm(axis)
     motion = printed_motion(scale)
     # Half of the one-sided printed turn before the middle of the workspace, half behind.
-    first = so3_exp(-np.asarray(motion.offset)) if policy != "receding" else np.eye(3)
+    online = policy in ("receding", "velocity_online")
+    first = np.eye(3) if online else so3_exp(-np.asarray(motion.offset))
     plant, position, rotation = _plant(arm, first, control, np.array(lever or PRINTED_CENTER))
     guess = GraspPrior(translation=np.array(PRINTED_CENTER), translation_sd=GUESS_SD)
     chosen: Policy
     estimator: OnlineGraspPose | PaperEstimator | None
-    if policy == "receding":
+    if online:
         settings = GraspSettings(time_offset=time_offset, max_time_offset=0.1)
         shape = pattern or (about_travel() if human == "planar" else two_tones())
-        chosen = RecedingPolicy(
-            RecedingExcitation(position, rotation, guess, shape, receding, NOISE, settings)
+        chosen = (
+            RecedingPolicy(RecedingExcitation(position, rotation, guess, shape, receding, NOISE, settings))
+            if policy == "receding"
+            else VelocityPolicy(position, rotation, _scaled(shape, 0.05), guess.translation, ramp=1.0)
         )
         estimator = OnlineGraspPose(NOISE, settings, prior=guess)
     else:
@@ -146,7 +151,7 @@ def cehajic2015_loop(
             if policy == "fixed"
             else VelocityPolicy(position, rotation, motion, kept, follow=policy == "velocity")
         )
-        estimator = PaperEstimator(lambda step: CehajicRecursion(step), orientation_error=error)
+        estimator = PaperEstimator(CehajicRecursion, orientation_error=error)
     return run_grasp_loop(
         plant,
         chosen,
@@ -159,6 +164,12 @@ def cehajic2015_loop(
         imu=imu,
         seed=seed,
         name=f"cehajic2015_loop ({policy}, {human} wrist)",
+    )
+
+
+def _scaled(shape: Sinusoids, factor: float) -> Sinusoids:
+    return Sinusoids(
+        factor * np.asarray(shape.offset), factor * np.asarray(shape.amplitude), shape.frequency, shape.phase
     )
 
 

@@ -275,7 +275,7 @@ def _rates(arm: Arm, data: Any, q: FloatArray, twist: FloatArray) -> FloatArray:
     """Smallest joint velocities with a twist of the frame."""
     pinocchio.computeJointJacobians(arm.model, data, q)
     J = pinocchio.getFrameJacobian(arm.model, data, arm.frame, pinocchio.LOCAL_WORLD_ALIGNED)
-    out = J.T @ np.linalg.solve(J @ J.T + 1e-8 * np.eye(6), twist)
+    out = J.T @ np.linalg.solve(J @ J.T + 1e-5 * np.eye(6), twist)
     limit = np.array(arm.model.velocityLimit)
     return np.asarray(np.clip(out, -limit, limit))
 

@@ -96,6 +96,8 @@ class VelocityPolicy:
         ``r_0``, m.
     follow : bool
         Use every new estimate, as the paper does.
+    ramp : float
+        s, from rest to the full motion; 0 for a motion that begins at rest.
     """
 
     def __init__(
@@ -105,9 +107,13 @@ class VelocityPolicy:
         motion: Sinusoids,
         lever: FloatArray,
         follow: bool = True,
+        ramp: float = 0.0,
     ) -> None:
         self._position, self._rotation = np.array(position, dtype=float), np.array(rotation, dtype=float)
         self._motion, self._follow, self._lever = motion, follow, np.array(lever, dtype=float)
+        self._rise = Blend(np.zeros(1) if ramp else np.ones(1))
+        if ramp:
+            self._rise.go(0.0, np.ones(1), ramp)
 
     def observe(self, t: float, estimate: OnlineGraspEstimate | None, lever: FloatArray | None) -> None:
         """See :class:`Policy`."""
@@ -116,7 +122,8 @@ class VelocityPolicy:
 
     def reference(self, t: FloatArray, travel: Curve, turn: Curve) -> PoseReference:
         """See :class:`Policy`."""
-        R, w, al = turned(self._rotation, plus(self._motion.derivatives(t), turn))
+        phi = plus(times(self._rise.at(t), self._motion.derivatives(t)), turn)
+        R, w, al = turned(self._rotation, phi)
         arm = R @ self._lever
         velocity = travel[1] - cross(w, arm)
         acceleration = travel[2] - cross(al, arm) - cross(w, cross(w, arm))

@@ -45,7 +45,7 @@ class HumanMotion:
         return times(up, self.travel.derivatives(t)), times(up, self.turn.derivatives(t))
 
 
-def human_motion(mode: HumanMode, travel: float = 0.1, angle: float = 0.25) -> HumanMotion:
+def human_motion(mode: HumanMode, travel: float = 0.06, angle: float = 0.12) -> HumanMotion:
     """The paper's three kinds of human motion (IV.A to IV.C).
 
     Parameters

@@ -48,7 +48,7 @@ def test_cone_about_the_wrist(tmp_path: Path) -> None:
     write_csv(tmp_path / "trajectory.csv", cone(10.0))
     (tmp_path / "e.toml").write_text(
         'kind = "excitation"\n[evaluate]\nfile = "trajectory.csv"\nwindow = 2.5\nreference = "mean"\n'
-        "[grasp]\ntranslation = [0.3, 0.0, 0.0]\n[human]\ntranslation_stiffness = 500.0\n"
+        "[grasp]\ntranslation = [0.3, 0.0, 0.0]\n[human]\nforce_stiffness = 500.0\n"
     )
     result = load_problem(tmp_path / "e.toml").solve()
     assert result.status.ok
@@ -57,7 +57,7 @@ def test_cone_about_the_wrist(tmp_path: Path) -> None:
     np.testing.assert_allclose(result.windows.lambda_min, expected, rtol=0.04)
     # The wrist itself does not move, and feels the rotation only.
     assert result.wrench_summary.peak_force < 0.05
-    assert result.wrench_summary.peak_torque == pytest.approx(5.0 * 0.15, rel=0.03)
+    assert result.wrench_summary.peak_torque == pytest.approx(2.0 * 0.15, rel=0.03)
     again = WrenchSummary.of(result.motion.wrist_wrench(np.zeros(3), WristStiffness(500.0, 5.0), "mean"))
     assert again.peak_force == pytest.approx(500.0 * 0.3 * 0.15, rel=0.05)
 
@@ -113,6 +113,16 @@ def test_torques_are_those_of_the_model(tmp_path: Path) -> None:
     assert joints.correlation[1] > 0.9999
 
 
+def test_what_is_known_before_counts(tmp_path: Path) -> None:
+    write_csv(tmp_path / "trajectory.csv", cone())
+    rows = [[0.0] * k + [1e-12] + [0.0] * (5 - k) for k in range(6)]
+    text = 'kind = "excitation"\n[evaluate]\nfile = "trajectory.csv"\n[grasp]\ncovariance = '
+    (tmp_path / "e.toml").write_text(text + json.dumps(rows) + "\n")
+    result = load_problem(tmp_path / "e.toml").solve()
+    assert np.all(result.prediction.sd <= 1.0001e-6)
+    assert np.all(result.prediction.sd > 0.9e-6)
+
+
 def test_demands_that_are_missed_are_said() -> None:
     task = ExcitationEvaluationTask(cone(), demands=Demands(alpha=1e3, translation_sd=1e-6))
     result = task.solve()
@@ -131,6 +141,7 @@ def test_demands_that_are_missed_are_said() -> None:
         ('[evaluate]\nfile = "trajectory.csv"\nalhpa = 2.0\n', "Did you mean alpha"),
         ('[evaluate]\nfile = "trajectory.csv"\ncolumns = "joints"\n', "those of joints"),
         ('[evaluate]\nfile = "trajectory.csv"\n[grasp]\nrotation_wxyz = [1.0, 1.0, 0.0, 0.0]\n', "norm 1.41"),
+        ('[evaluate]\nfile = "trajectory.csv"\n[grasp]\ncovariance = [[1.0, 2.0]]\n', "array of 6"),
         ('[evaluate]\nfile = "trajectory.csv"\n[human]\nstiffnes = 3.0\n', "an unknown one"),
         ('[evaluate]\nfile = "joints.csv"\n', "urdf"),
         ('[evaluate]\nfile = "joints.csv"\n[robot]\nurdf = "arm.urdf"\nframe = "tool"\n', "one of universe"),
