@@ -40,6 +40,7 @@ scenarios: dict[str, Scenario] = {
     "cordella2014": Scenario(
         "factorgrasp.simulation.wrist:cordella2014",
         "wrist pose from six blobs (Cordella 2014; option motion='abduction' | 'flexion' | 'pronation' | 'three_axes' | 'reach')",
+    ),
     "cehajic2015_loop": Scenario(
         "factorgrasp.simulation.cehajic2015_loop:cehajic2015_loop",
         "closed loop of Cehajic 2015: arm, impedance, wrist, estimator (options policy='receding' | 'velocity' | 'biased', arm)",
