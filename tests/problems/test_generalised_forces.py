@@ -30,7 +30,11 @@ def leg() -> Any:
     hip = model.addJoint(0, pin.JointModelRY(), pin.SE3.Identity(), "hip")
     model.appendBodyToJoint(hip, body, pin.SE3.Identity())
     at = hip
-    for name, joint in (("slide_x", pin.JointModelPX()), ("slide_z", pin.JointModelPZ()), ("knee", pin.JointModelRY())):
+    for name, joint in (
+        ("slide_x", pin.JointModelPX()),
+        ("slide_z", pin.JointModelPZ()),
+        ("knee", pin.JointModelRY()),
+    ):
         place = pin.SE3(np.eye(3), np.array([0.0, 0.0, -0.4])) if name == "slide_x" else pin.SE3.Identity()
         at = model.addJoint(at, joint, place, name)
     model.appendBodyToJoint(at, body, pin.SE3.Identity())
