@@ -23,7 +23,7 @@ from metrics import Metric, metric_table, missed
 
 from factorgrasp.atomic import write_text
 from factorgrasp.simulation.human_dynamics import HANDS, HumanNoise, human_bowing, human_carrying, human_tpose
-from factorgrasp.simulation.human_dynamics_consistency import monte_carlo
+from factorgrasp.simulation.human_dynamics_consistency import monte_carlo, two_tasks_and_joint
 from factorgrasp.solvers.measure import environment
 
 PACKAGES = ("numpy", "scipy", "numba", "qdldl", "pin", "piqp", "idyntree", "opensim")
@@ -48,6 +48,11 @@ def consistency(seeds: int) -> list[Metric]:
             note = f"{found.dof} degrees of freedom; {exact[what].ratio:.3g} with poses taken to be exact"
             out.append(Metric(f"NEES/{name}, {what}", found.ratio, "", "within", found.band, note))
             print(f"  {out[-1].key}: {found.ratio:.4f}", flush=True)
+    for method, (rms, sd, nees) in two_tasks_and_joint(
+        cases["T-pose, 5 kg"][0], range(min(seeds, 4)), ("RightHand",)
+    ).items():
+        note = f"stated sd {sd:.3f} Nm RMS; NEES per degree of freedom {nees:.3g}"
+        out.append(Metric(f"T-pose, 5 kg, {method}/RMS error of torques", rms, "Nm", note=note))
     return out
 
 

@@ -9,12 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
 from factorgrasp.human_dynamics_payload import contact_rows, payload_of
+from factorgrasp.problems.external_wrenches import ExternalWrenches
 from factorgrasp.problems.human_dynamics import HumanDynamics
-from factorgrasp.problems.human_dynamics_sensors import Sensor
+from factorgrasp.problems.human_dynamics_sensors import ExternalWrench, Sensor
 from factorgrasp.problems.human_dynamics_state import torque_turn
 from factorgrasp.simulation.human_dynamics import FEET
 from factorgrasp.simulation.human_recording import HumanRecording
@@ -25,6 +27,9 @@ from factorgrasp.uncertainty import nees_band
 EXACT_MODEL = 1e-10
 """Variance of a model that makes no errors, as the simulated one: what is tested is what noise of sensors does."""
 ARMS = ("Shoulder", "Elbow", "Wrist")
+WRIST = (1e4, 1e4, 1e4, 1e2, 1e2, 1e2)
+"""Of a hand's wrench about the wrist."""
+Method = Literal["joint, points known", "joint", "two tasks"]
 HAND = (1e4, 1e4, 1e4, 1e-8, 1e-8, 1e-8)
 """Of a hand's wrench about where it holds: any force, no moment."""
 
@@ -75,6 +80,8 @@ class Errors:
         Of all frames together.
     mass_error : ndarray
         (n,) kg, empty without a payload.
+    torque_error, torque_sd : ndarray
+        (n, dofs) Nm.
     """
 
     torque: FloatArray
@@ -83,6 +90,8 @@ class Errors:
     torque_dof: int
     wrench_dof: int
     mass_error: FloatArray
+    torque_error: FloatArray
+    torque_sd: FloatArray
 
 
 def errors_of(
@@ -91,6 +100,7 @@ def errors_of(
     imus: bool = False,
     state_noise: bool = True,
     offset: int = 0,
+    method: Method = "joint, points known",
 ) -> Errors:
     """Normalised errors of one recording at frames a window of its filter apart.
 
@@ -105,6 +115,9 @@ def errors_of(
         False: poses taken to be exact, as in the papers.
     offset : int
         First frame.
+    method : {"joint, points known", "joint", "two tasks"}
+        One estimate with the hands' moments known to be none where they hold; the same with moments of 10 Nm about the wrists; or, with those, the
+        wrenches by momentum first and their posterior into the second task (Tirupachuri 2021).
     """
     motion, keep, own = recording.measured_motion
     frames = np.arange(offset, len(motion), recording.filter_window)
@@ -118,8 +131,18 @@ def errors_of(
         sensors += recording.imus(at)
     links = (*FEET, *hands)
     points = {link: recording.body.segments[link].com for link in hands}
-    contacts = [contact_rows(part, noise, tuple(hands), points)] if hands else []
-    problem = HumanDynamics(part, [*sensors, *contacts], noise)
+    if method == "joint, points known":
+        contacts = [contact_rows(part, noise, tuple(hands), points)] if hands else []
+        problem = HumanDynamics(part, [*sensors, *contacts], noise)
+    else:
+        noise = replace(noise, contact_wrench=WRIST)
+        plates = [sensor for sensor in sensors if isinstance(sensor, ExternalWrench)]
+        others = [sensor for sensor in sensors if not isinstance(sensor, ExternalWrench)]
+        if method == "two tasks":
+            first = ExternalWrenches(part, plates, hands, noise).estimate().as_sensor()
+            problem = HumanDynamics(part, [*others, first], noise)
+        else:
+            problem = HumanDynamics(part, sensors, noise, hands)
     columns = problem.system.columns
     wrenches = np.concatenate([columns.external_wrench[part.link(link)] for link in links])
     held = [columns.external_wrench[part.link(link)] for link in hands]
@@ -146,12 +169,19 @@ def errors_of(
     error = np.where(told, error, 0.0)
     C_wrench = np.where(told[:, :, None] & told[:, None, :], C_wrench, np.eye(error.shape[1]))
     payload, mass_error = np.empty(0), np.empty(0)
-    if hands:
+    if hands and method != "two tasks":
         load = payload_of(part, noise, tuple(hands), tuple(hands), x[:, groups[2]], P[2], points)
         mass_error = load.mass - recording.truth.payload
         payload = (mass_error / load.mass_sd) ** 2
     return Errors(
-        _nees(torque - true, C), _nees(error, C_wrench), payload, true.size, int(told.sum()), mass_error
+        _nees(torque - true, C),
+        _nees(error, C_wrench),
+        payload,
+        true.size,
+        int(told.sum()),
+        mass_error,
+        torque - true,
+        np.sqrt(np.diagonal(C, axis1=1, axis2=2)),
     )
 
 
@@ -200,6 +230,23 @@ def monte_carlo(
         out["payload"] = Consistency(
             "payload", _sum(e.payload for e in found), sum(e.payload.size for e in found)
         )
+    return out
+
+
+def two_tasks_and_joint(
+    make: Callable[[int], HumanRecording], seeds: Iterable[int], hands: Sequence[str]
+) -> dict[str, tuple[float, float, float]]:
+    """By method: RMS error of torques and the RMS of their stated sd, Nm, and NEES per degree of freedom of all torques together."""
+    out = {}
+    recordings = [make(seed) for seed in seeds]
+    methods: tuple[Method, ...] = ("two tasks", "joint", "joint, points known")
+    for method in methods:
+        found = [errors_of(recording, hands, method=method) for recording in recordings]
+        rms, sd = (
+            float(np.sqrt(np.mean([np.mean(x**2) for x in each])))
+            for each in zip(*((e.torque_error, e.torque_sd) for e in found), strict=True)
+        )
+        out[method] = rms, sd, _sum(e.torque for e in found) / sum(e.torque_dof for e in found)
     return out
 
 
