@@ -128,6 +128,19 @@ def estimate_state(
     )  # fmt: skip
 
 
+def configurations(
+    model: Any,
+    observations: BodyObservations,
+    *,
+    posture: FloatArray | None = None,
+    posture_sd: float = POSTURE_SD,
+) -> FloatArray:
+    """Configurations (n, nq) frame by frame, without a motion prior: what inverse kinematics usually is."""
+    body = observed(model, observations)
+    rest = body.neutral() if posture is None else np.asarray(posture, dtype=float)
+    return _frame_by_frame(body, observations, rest, _posture(body, posture_sd))
+
+
 def solve_posture(
     model: Any, observations: BodyObservations, posture: FloatArray, posture_sd: float
 ) -> FloatArray:
