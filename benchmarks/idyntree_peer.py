@@ -149,18 +149,18 @@ class IDynTreePeer:
     def estimate(
         self, q: np.ndarray, qd: np.ndarray, base_rate: np.ndarray, y: np.ndarray
     ) -> tuple[np.ndarray, float]:
-        """Unknowns d in iDynTree's order and the seconds spent in iDynTree."""
+        """Unknowns d in iDynTree's order and the processor's seconds spent in iDynTree."""
         idt = self.idt
         jq, jv = idt.JointPosDoubleArray(self.model), idt.JointDOFsDoubleArray(self.model)
         for i in range(q.size):
             jq.setVal(i, float(q[i]))
             jv.setVal(i, float(qd[i]))
         rate, measured = idt.Vector3.FromPython(base_rate.tolist()), idt.VectorDynSize.FromPython(y.tolist())
-        started = time.perf_counter()
+        started = time.process_time()
         self.solver.updateEstimateInformationFloatingBase(jq, jv, self.base, rate, measured)
         if not self.solver.doEstimate():
             raise RuntimeError("iDynTree did not solve")
-        seconds = time.perf_counter() - started
+        seconds = time.process_time() - started
         out = idt.VectorDynSize(self.size)
         self.solver.getLastEstimate(out)
         return out.toNumPy().copy(), seconds

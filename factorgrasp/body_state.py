@@ -45,7 +45,7 @@ class BodyState:
         (n, nq), (n, nv), (n, nv), as pinocchio has them; NaN in frames that are not `good`.
     q_variance, qd_variance, qdd_variance : ndarray, shape (n, nv)
         Of every component; those of a free-flyer's translation along the world's axes.
-    q_covariance : ndarray, shape (n, nv, nv)
+    q_covariance, qdd_covariance : ndarray, shape (n, nv, nv)
     good : ndarray, shape (n,)
         False where too little was seen to tell the whole configuration, and at both ends.
     residual_sd : float
@@ -64,6 +64,7 @@ class BodyState:
     qd_variance: FloatArray
     qdd_variance: FloatArray
     q_covariance: FloatArray
+    qdd_covariance: FloatArray
     good: BoolArray
     residual_sd: float
     worst_marker: tuple[str, float]
@@ -117,14 +118,14 @@ def estimate_state(
     q = _frame_by_frame(body, observations, rest, pull)
     variance = _information_variance(body, q, pull)
     jerk, _ = jerk_scale(_unrolled(body, q), variance, dt, bandwidth)
-    q, Q, qd2, qdd2 = _smooth(body, q, rest, pull, jerk, dt)
+    q, Q, qd2, A = _smooth(body, q, rest, pull, jerk, dt)
     v, a = body.derivatives(q, dt)
     good = _told(body, q, pull, variance, round(max_gap / dt))
     good[[0, -1]] = False
     q, v, a = (np.where(good[:, None], x, np.nan) for x in (q, v, a))
     ratio, worst = _fit(body, observations, q, Q, good)
     return BodyState(
-        t, q, v, a, np.diagonal(Q, axis1=1, axis2=2).copy(), qd2, qdd2, Q, good, ratio, worst, jerk
+        t, q, v, a, np.diagonal(Q, axis1=1, axis2=2).copy(), qd2, np.diagonal(A, axis1=1, axis2=2).copy(), Q, A, good, ratio, worst, jerk
     )  # fmt: skip
 
 
@@ -290,7 +291,7 @@ def _smooth(
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     count = len(q)
     out, nv = q.copy(), body.nv
-    Q, qd2, qdd2 = np.empty((count, nv, nv)), np.empty((count, nv)), np.empty((count, nv))
+    Q, qd2, A = np.empty((count, nv, nv)), np.empty((count, nv)), np.empty((count, nv, nv))
     step = WINDOW - 2 * OVERLAP
     for begin in range(0, count, step) if count > WINDOW else (0,):
         low, high = max(0, begin - OVERLAP), min(count, begin + step + OVERLAP)
@@ -299,8 +300,8 @@ def _smooth(
         part, C, v2, a2 = _smooth_window(body, q[low:high], slice(low, high), rest, pull, jerk, dt)
         keep = slice(begin, min(count, begin + step) if count > WINDOW else count)
         inside = slice(keep.start - low, keep.stop - low)
-        out[keep], Q[keep], qd2[keep], qdd2[keep] = part[inside], C[inside], v2[inside], a2[inside]
-    return out, Q, qd2, qdd2
+        out[keep], Q[keep], qd2[keep], A[keep] = part[inside], C[inside], v2[inside], a2[inside]
+    return out, Q, qd2, A
 
 
 def _smooth_window(
@@ -377,24 +378,24 @@ def _assemble(H: FloatArray, band: FloatArray, weight: FloatArray, blocks: int) 
 def _marginals(
     system: BlockTridiagonal, count: int, nv: int, dt: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Covariances of configurations and variances of velocities and accelerations."""
+    """Covariances of configurations, variances of velocities and covariances of accelerations."""
     Z, up = system.inverse_band()
     Z, up = Z.reshape(-1, 3, nv, 3, nv), up.reshape(-1, 3, nv, 3, nv)
 
-    def own(i: int, j: int) -> FloatArray:
-        """Variances (nv,) between frames i <= j."""
+    def block(i: int, j: int) -> FloatArray:
+        """Covariance (nv, nv) between frames i <= j."""
         (b, r), (c, s) = divmod(i, 3), divmod(j, 3)
-        return np.asarray(np.einsum("ii->i", Z[b, r, :, s, :] if b == c else up[b, r, :, s, :]))
+        return np.asarray(Z[b, r, :, s, :] if b == c else up[b, r, :, s, :])
 
-    Q = np.array([Z[k // 3, k % 3, :, k % 3, :] for k in range(count)])
-    v2, a2 = np.empty((count, nv)), np.empty((count, nv))
+    Q = np.array([block(k, k) for k in range(count)])
+    v2, A = np.empty((count, nv)), np.empty((count, nv, nv))
     for k in range(count):
         m = min(max(k, 1), count - 2)
-        A, B, C = own(m - 1, m - 1), own(m, m), own(m + 1, m + 1)
-        AB, BC, AC = own(m - 1, m), own(m, m + 1), own(m - 1, m + 1)
-        v2[k] = (A + C - 2.0 * AC) / (4.0 * dt**2)
-        a2[k] = (A + 4.0 * B + C - 4.0 * AB - 4.0 * BC + 2.0 * AC) / dt**4
-    return Q, v2, a2
+        last, next_, apart = block(m - 1, m), block(m, m + 1), block(m - 1, m + 1)
+        v2[k] = np.diagonal(Q[m - 1] + Q[m + 1] - 2.0 * apart) / (4.0 * dt**2)
+        mixed = apart - 2.0 * (last + next_)
+        A[k] = (Q[m - 1] + 4.0 * Q[m] + Q[m + 1] + mixed + mixed.T) / dt**4
+    return Q, v2, A
 
 
 def _fit(

@@ -359,13 +359,20 @@ def _check_upright(model: Any, state: BodyState, gravity: Vector) -> None:
 
 
 def state_noise(state: BodyState, tree: PinocchioTree) -> StateNoise:
-    """Variances of the configurations at the good frames, in the order that a link motion has; accelerations have theirs apart."""
-    variance = state.q_variance[state.good].copy()
+    """Noise of configurations and accelerations at the good frames, in the order and frames that a link motion has.
+
+    Accelerations keep their correlations: joints that take turns in an error, as vertebrae between two markers do, move nothing else.
+    """
+    at = tree.tangent_columns
+    Q, A = state.q_covariance[state.good], state.qdd_covariance[state.good]
     if tree.floating:
-        R = lie.quaternion_wxyz_to_matrix(np.roll(state.q[state.good, 3:7], 1, axis=1))
-        P = np.swapaxes(R, 1, 2) @ state.q_covariance[state.good, :3, :3] @ R
-        variance[:, :3] = np.diagonal(P, axis1=1, axis2=2)
-    return StateNoise(variance[:, tree.tangent_columns])
+        back = np.broadcast_to(np.eye(Q.shape[1]), Q.shape).copy()
+        turn = lie.quaternion_wxyz_to_matrix(np.roll(state.q[state.good, 3:7], 1, axis=1))
+        back[:, :3, :3] = np.swapaxes(turn, 1, 2)
+        Q, A = (back @ C @ np.swapaxes(back, 1, 2) for C in (Q, A))
+    Q = np.diagonal(Q, axis1=1, axis2=2)[:, at]
+    A = A[:, at][:, :, at]
+    return StateNoise(Q, acceleration=0.5 * (A + np.swapaxes(A, 1, 2)) + 1e-10 * np.eye(at.size))
 
 
 def _variances(model: Any, state: BodyState) -> dict[str, PerName]:

@@ -141,7 +141,7 @@ class ExternalWrenches:
     ) -> ExternalWrenchesEstimate:
         motion, links = self.motion, self.motion.links
         AC = A @ C
-        S = np.einsum("nlij,nlkj->nik", AC, A) + np.diag(self._momentum)
+        S = (AC @ np.swapaxes(A, -1, -2)).sum(axis=1) + np.diag(self._momentum)
         spread = None
         if motion.state_noise is not None:
             measured = [links.index(sensor.link) for sensor in self.sensors]
@@ -155,7 +155,7 @@ class ExternalWrenches:
                 AC[:, link] += F[:, :, : E.shape[2]] @ np.swapaxes(E, 1, 2)
         innovation = motion.momentum_rate - np.einsum("nlij,nlj->ni", A, mean)
         weighted = np.linalg.solve(S, innovation[..., None])
-        gain = np.linalg.solve(S[:, None], AC)
+        gain = np.linalg.inv(S)[:, None] @ AC
         covariance = C - np.swapaxes(AC, -1, -2) @ gain
         if spread is not None:
             for i, link in enumerate(measured):

@@ -38,6 +38,8 @@ class HumanDynamicsEstimate:
         (n, J, 3, 3).
     joint_wrench, joint_wrench_sd : ndarray
         (n, J, 6) ``[force; moment]`` in the child's frame.
+    joint_wrench_covariance : ndarray
+        (n, J, 6, 6).
     external_wrench, external_wrench_sd : ndarray
         (n, L, 6) net external wrench on every link in its frame.
     external_wrench_covariance : ndarray
@@ -70,6 +72,7 @@ class HumanDynamicsEstimate:
     joint_moment_covariance: FloatArray
     joint_wrench: FloatArray
     joint_wrench_sd: FloatArray
+    joint_wrench_covariance: FloatArray
     external_wrench: FloatArray
     external_wrench_sd: FloatArray
     external_wrench_covariance: FloatArray
@@ -121,6 +124,19 @@ def _by_group(groups: Sequence[IntArray], blocks: Sequence[FloatArray]) -> dict[
     )
 
 
+def _nothing(*shape: int) -> FloatArray:
+    return np.broadcast_to(np.nan, shape)
+
+
+def _at(sd: FloatArray | None, columns: IntArray, count: int) -> FloatArray:
+    """Standard deviations (n, ...) of some unknowns."""
+    return (
+        _nothing(count, *columns.shape)
+        if sd is None
+        else sd[:, columns.ravel()].reshape(count, *columns.shape)
+    )
+
+
 def read_frames(problem: HumanDynamics, result: Any) -> HumanDynamicsEstimate:
     """Typed view of a :class:`factorgrasp.solvers.frames.FrameResult`."""
     from factorgrasp.problems.human_dynamics_active import active_constraints
@@ -131,22 +147,21 @@ def read_frames(problem: HumanDynamics, result: Any) -> HumanDynamicsEstimate:
     k = problem.kinematics
     have = bool(result.marginals)
     known = _by_group(system.marginals, result.marginals)
-    nothing = np.full((count, 6, 6), np.nan)
+    turning = system.turning
+    # Without covariances: views of a single NaN, as arrays of it would take longer than the solve.
     P_joint = (
-        np.stack(result.marginals[:joints], axis=1)
-        if have and joints
-        else np.full((count, joints, 6, 6), np.nan)
+        np.stack(result.marginals[:joints], axis=1) if have and joints else _nothing(count, joints, 6, 6)
     )
     P_link = (
-        np.stack(result.marginals[joints : joints + links], axis=1)
-        if have
-        else np.repeat(nothing[:, None], links, axis=1)
+        np.stack(result.marginals[joints : joints + links], axis=1) if have else _nothing(count, links, 6, 6)
     )
-    sd = np.sqrt(np.maximum(result.variances, 0.0)) if have else np.full(x.shape, np.nan)
+    sd = np.sqrt(np.maximum(result.variances, 0.0)) if have else None
     acceleration = x[:, columns.acceleration.ravel()].reshape(count, links, 6)
-    acceleration_sd = sd[:, columns.acceleration.ravel()].reshape(count, links, 6)
+    acceleration_sd = _at(sd, columns.acceleration, count)
     if tree.fixed_base:
-        acceleration[:, tree.root], acceleration_sd[:, tree.root] = k.acceleration[:, tree.root], 0.0
+        acceleration[:, tree.root] = k.acceleration[:, tree.root]
+        if have:
+            acceleration_sd[:, tree.root] = 0.0
     wrench = x[:, columns.joint_wrench.ravel()].reshape(count, joints, 6)
     torque, torque_cov = [], []
     for j in system.axes:
@@ -154,7 +169,10 @@ def read_frames(problem: HumanDynamics, result: Any) -> HumanDynamicsEstimate:
         assert S is not None
         back = np.swapaxes(S, 1, 2)
         torque.append((back @ wrench[:, j, :, None])[..., 0])
-        group = system.turning.get(j)
+        group = turning.get(j)
+        if group is None and not have:
+            torque_cov.append(_nothing(count, S.shape[2], S.shape[2]))
+            continue
         if group is None:
             torque_cov.append(np.asarray(back @ P_joint[:, j] @ S))
             continue
@@ -163,7 +181,7 @@ def read_frames(problem: HumanDynamics, result: Any) -> HumanDynamicsEstimate:
         torque[-1] = torque[-1] + (T @ x[:, group[6:], None])[..., 0]
         reader = np.concatenate([back, T], axis=2)
         P = known.get(tuple(map(int, group)))
-        blank = np.full((count, S.shape[2], S.shape[2]), np.nan)
+        blank = _nothing(count, S.shape[2], S.shape[2])
         torque_cov.append(blank if P is None else np.asarray(reader @ P @ np.swapaxes(reader, 1, 2)))
     dofs = [columns.joint_acceleration[j] for j in system.axes]
     at = np.concatenate([*dofs, np.empty(0, dtype=np.intp)]).astype(np.intp)
@@ -183,16 +201,19 @@ def read_frames(problem: HumanDynamics, result: Any) -> HumanDynamicsEstimate:
         torque_covariance=tuple(torque_cov),
         joint_moment=(T @ wrench[..., None])[..., 0],
         joint_force=(R @ wrench[..., :3, None])[..., 0],
-        joint_moment_covariance=T @ P_joint @ np.swapaxes(T, -1, -2),
+        joint_moment_covariance=T @ P_joint @ np.swapaxes(T, -1, -2)
+        if have
+        else _nothing(count, joints, 3, 3),
         joint_wrench=wrench,
-        joint_wrench_sd=sd[:, columns.joint_wrench.ravel()].reshape(count, joints, 6),
+        joint_wrench_sd=_at(sd, columns.joint_wrench, count),
+        joint_wrench_covariance=P_joint,
         external_wrench=x[:, columns.external_wrench.ravel()].reshape(count, links, 6),
-        external_wrench_sd=sd[:, columns.external_wrench.ravel()].reshape(count, links, 6),
+        external_wrench_sd=_at(sd, columns.external_wrench, count),
         external_wrench_covariance=P_link,
         acceleration=acceleration,
         acceleration_sd=acceleration_sd,
         joint_acceleration=x[:, at],
-        joint_acceleration_sd=sd[:, at],
+        joint_acceleration_sd=_at(sd, at, count),
         innovations=innovations(problem, k, result) if have else (),
         status=tuple(result.status),
         messages=dict(result.messages),

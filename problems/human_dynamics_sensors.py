@@ -74,6 +74,13 @@ class Sensor:
         InputError
             When it has none of them, or is not positive.
         """
+        known = self.__dict__.get("_checked")
+        if known is None:
+            known = self._check_covariance()
+            object.__setattr__(self, "_checked", known)
+        return np.asarray(known)
+
+    def _check_covariance(self) -> FloatArray:
         n, k = self.values.shape
         C = np.asarray(self.covariance, dtype=float)
         if C.ndim == 0:
@@ -92,10 +99,13 @@ class Sensor:
                 "A gap is a NaN among the values",
             )
         if full:
-            if np.linalg.eigvalsh(C).min() <= 0.0:
+            try:
+                # One that fails here has no square root either, which the estimate needs.
+                np.linalg.cholesky(C)
+            except np.linalg.LinAlgError:
                 raise InputError(
                     f"covariance of {self.name}", "a positive definite matrix", "a singular or indefinite one"
-                )
+                ) from None
         elif np.any(C <= 0.0):
             raise InputError(
                 f"covariance of {self.name}", f"variances above zero in ({self.unit})^2", f"{C.min():.6g}"

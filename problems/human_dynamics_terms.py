@@ -178,7 +178,7 @@ class DynamicsTerms:
         return terms
 
     def zero(self, sensors: Sequence[Sensor]) -> list[Term]:
-        """Zero external wrench: tight on free links, loose on contacts that nobody measures."""
+        """Zero external wrench: tight on free links, loose on contacts that nobody measures, none on a fixed base."""
         tree = self.tree
         measured = {
             link
@@ -200,7 +200,8 @@ class DynamicsTerms:
         )
         terms = []
         for i, link in enumerate(tree.links):
-            if link in measured:
+            # What holds a fixed base is not measured either, and it is never nothing.
+            if link in measured or (self.given(i) and link not in self.contacts):
                 continue
             touched = link in self.contacts
             name = f"unmeasured wrench on {link}" if touched else f"no wrench on {link}"

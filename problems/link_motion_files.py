@@ -69,6 +69,27 @@ def _read(path: str | Path, needed: tuple[str, ...]) -> dict[str, Any]:
         raise InputError(str(file), "an archive of link-level arrays (.npz)", str(error)) from error
 
 
+def load_coordinates(path: str | Path) -> dict[str, tuple[FloatArray, FloatArray]]:
+    """Coordinates of an archive of links: name to value (n,) and rate (n,), rad or m and per second.
+
+    Raises
+    ------
+    InputError
+        When the archive has none.
+    """
+    with np.load(path, allow_pickle=False) as archive:
+        missing = [name for name in ("names", "Q", "dQ") if name not in archive]
+        if missing:
+            raise InputError(
+                str(Path(path).name), "coordinates: the fields names, Q, dQ", "no " + ", ".join(missing)
+            )
+        names, Q, dQ = (archive[name] for name in ("names", "Q", "dQ"))
+    return {
+        str(name): (np.asarray(Q[:, i], dtype=float), np.asarray(dQ[:, i], dtype=float))
+        for i, name in enumerate(names)
+    }
+
+
 def load_links(
     path: str | Path,
     gravity: tuple[float, float, float] = (0.0, -9.80665, 0.0),

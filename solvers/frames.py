@@ -305,7 +305,8 @@ def solve_frames(
         Such as :class:`factorgrasp.problems.human_dynamics.HumanDynamics`.
     solver : str, optional
         By default "cholesky" by one plan for all frames; with inequalities "active-set", which hands frames that it cannot settle to the
-        best QP solver installed; with equality constraints "kkt" or that QP solver, frame by frame. Any other solver's name also works so.
+        best QP solver installed; "piqp" then finds the active rows by an interior point and polishes what follows
+        from them; with equality constraints "kkt" or that QP solver, frame by frame. Any other solver's name also works so.
     options : SolverOptions, optional
         For a solver that goes frame by frame.
     covariance : bool
@@ -339,16 +340,26 @@ def _solve_frames(
     )
     if solver in (None, "cholesky") and not first.constrained:
         return _all_at_once(problem, covariance)
-    if solver in (None, "active-set") and only_rows and hasattr(problem, "inequality_frames"):
-        return _by_active_set(problem, options, covariance)
+    if solver in (None, "active-set", "piqp") and only_rows and hasattr(problem, "inequality_frames"):
+        return _with_inequalities(problem, solver or "active-set", options, covariance)
     return _one_by_one(problem, first, solver, options, covariance)
 
 
-def _by_active_set(problem: Any, options: SolverOptions | None, covariance: bool) -> FrameResult:
+def _with_inequalities(
+    problem: Any, name: str, options: SolverOptions | None, covariance: bool
+) -> FrameResult:
     from factorgrasp.solvers.frame_active_set import ActiveSetSolver
 
     started = time.perf_counter()
-    machine = ActiveSetSolver(problem)
+    if name == "piqp":
+        from factorgrasp.solvers.frame_piqp import PiqpFrames
+
+        get_solver(name, options)  # whose error says how to install it
+        chosen = options or SolverOptions()
+        limits = {} if chosen.max_iterations is None else {"max_iter": chosen.max_iterations}
+        machine: Any = PiqpFrames(problem, {"eps_abs": chosen.tolerance, **limits, **chosen.extra})
+    else:
+        machine = ActiveSetSolver(problem)
     count = problem.frame_count
     step = max(LANES, MOST_ENTRIES // max(problem.pattern.jacobian.matrix.nnz, 1))
     parts, left = [], []
@@ -356,10 +367,11 @@ def _by_active_set(problem: Any, options: SolverOptions | None, covariance: bool
         found = machine.solve(slice(first, min(first + step, count)), covariance)
         parts.append(found.result)
         left += [first + int(f) for f in np.flatnonzero(~found.settled)]
-    whole = _joined(parts, step, started, "active-set")
+    whole = _joined(parts, step, started, name)
     if not left:
         return whole
-    rest = _one_by_one(problem, problem.frame(left[0]), None, options, covariance, left)
+    backend = None if name == "active-set" else name
+    rest = _one_by_one(problem, problem.frame(left[0]), backend, options, covariance, left)
     status, solutions = list(whole.status), list(whole.solutions)
     for i, f in enumerate(left):
         whole.x[f], status[f], solutions[f] = rest.x[i], rest.status[i], rest.solutions[i]
@@ -369,7 +381,7 @@ def _by_active_set(problem: Any, options: SolverOptions | None, covariance: bool
                 mine[f] = theirs[i]
     messages = {**whole.messages, **{left[i]: words for i, words in rest.messages.items()}}
     return FrameResult(
-        whole.x, whole.variances, whole.marginals, tuple(status), messages, f"active-set, {rest.solver} in {len(left)} frames",
+        whole.x, whole.variances, whole.marginals, tuple(status), messages, f"{name}, {rest.solver} in {len(left)} frames",
         time.perf_counter() - started, whole.careful, tuple(solutions),
     )  # fmt: skip
 

@@ -211,6 +211,9 @@ class OnlineHumanDynamics:
         columns, x, S = self.system.columns, result.x[0], k.axes[0]
         wrench = x[columns.joint_wrench]
         torque = np.einsum("di,di->d", S, wrench[self._owner])
+        turns = {j: torque_turn(S[self._owner == j].T[None], wrench[j][None])[0] for j in self._turning}
+        for j, T in turns.items():
+            torque[self._owner == j] += T @ x[self._turning[j][6:]]
         sd, cov = np.empty(0), np.empty((0, 6, 6))
         if self.covariance:
             joints = wrench.shape[0]
@@ -218,13 +221,10 @@ class OnlineHumanDynamics:
             P = np.stack(result.marginals[: joints + links])[:, 0]
             variance = np.einsum("di,dij,dj->d", S, P[self._owner], S)
             cov = P[joints:]
-            for (j, group), block in zip(
-                self._turning.items(), result.marginals[joints + links :], strict=True
-            ):
+            for j, block in zip(self._turning, result.marginals[joints + links :], strict=True):
                 own = np.flatnonzero(self._owner == j)
-                reader = np.concatenate([S[own], torque_turn(S[own].T[None], wrench[j][None])[0]], axis=1)
+                reader = np.concatenate([S[own], turns[j]], axis=1)
                 variance[own] = np.einsum("di,ij,dj->d", reader, block[0], reader)
-                torque[own] += reader[:, 6:] @ x[group[6:]]
             sd = np.sqrt(np.maximum(variance, 0.0))
         self.frames += 1
         latency = time.perf_counter() - started

@@ -113,7 +113,7 @@ def errors_of(
         part = part.with_state_noise(recording.state_noise)
     at = np.flatnonzero(keep)[frames]
     noise = replace(own, propagation=EXACT_MODEL, balance=EXACT_MODEL, free_wrench=1e-10, contact_wrench=HAND)
-    sensors: list[Sensor] = [*recording.foot_sensors(part, at, unloaded=1e-6)]
+    sensors: list[Sensor] = [*recording.foot_sensors(part, at, unloaded=1e-10)]
     if imus:
         sensors += recording.imus(at)
     links = (*FEET, *hands)
