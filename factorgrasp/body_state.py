@@ -11,21 +11,20 @@ from typing import Any
 
 import numpy as np
 
-from factorgrasp import lie
 from factorgrasp.body_state_prior import jerk_scale, third_difference_band
 from factorgrasp.errors import InputError
-from factorgrasp.models.joint_motion import free_flyer
-from factorgrasp.problems.body_observations import BodyObservations, ObservedBody
+from factorgrasp.problems.body_observations import BodyObservations
+from factorgrasp.problems.observed_osim import Observed, observed
 from factorgrasp.solvers.block_tridiagonal import BlockTridiagonal
 from factorgrasp.typing import BoolArray, FloatArray
 
 POSTURE_SD = 1.0
 """Rad: how far joints are from the zero configuration, for what nothing else tells of."""
-LIMIT_SD = 0.02
-"""Rad beyond a joint's limit that cost as much as one standard deviation."""
 WINDOW, OVERLAP = 300, 45
 """Frames that are smoothed at once, and frames that neighbouring windows share: together they bound the memory."""
 _CHUNK = 128
+# Information that holds what cannot move.
+_HELD = 1e12
 _KEY = 10
 _STEPS = 40
 MAX_GAP = 0.1
@@ -46,7 +45,7 @@ class BodyState:
         (n, nq), (n, nv), (n, nv), as pinocchio has them; NaN in frames that are not `good`.
     q_variance, qd_variance, qdd_variance : ndarray, shape (n, nv)
         Of every component; those of a free-flyer's translation along the world's axes.
-    q_covariance : ndarray, shape (n, nv, nv)
+    q_covariance, qdd_covariance : ndarray, shape (n, nv, nv)
     good : ndarray, shape (n,)
         False where too little was seen to tell the whole configuration, and at both ends.
     residual_sd : float
@@ -65,6 +64,7 @@ class BodyState:
     qd_variance: FloatArray
     qdd_variance: FloatArray
     q_covariance: FloatArray
+    qdd_covariance: FloatArray
     good: BoolArray
     residual_sd: float
     worst_marker: tuple[str, float]
@@ -85,9 +85,9 @@ def estimate_state(
 
     Parameters
     ----------
-    model : pinocchio.Model
-        Hinges, sliders and ball joints, with or without a free-flyer as first joint. Limits of hinges are respected where they are
-        narrower than a full turn.
+    model : pinocchio.Model or OsimModel
+        Hinges, sliders and ball joints, with or without a free-flyer as first joint; or an OpenSim model, whose coordinates are the
+        configuration then. Limits of hinges are respected where they are narrower than a full turn.
     t : (n,) ndarray
         Uniform times, s.
     observations : BodyObservations
@@ -106,45 +106,56 @@ def estimate_state(
     InputError
         For fewer than five frames, uneven times, or no frame in which three points are seen.
     """
-    import pinocchio as pin
-
     count = t.size
     if count < 5:
         raise InputError("frames", "at least five", str(count))
     dt = float(np.median(np.diff(t)))
     if np.abs(np.diff(t) - dt).max() > 0.02 * dt:
         raise InputError("t", "uniform times", f"steps from {np.diff(t).min():g} to {np.diff(t).max():g} s")
-    body = ObservedBody(model, observations)
-    rest = np.asarray(pin.neutral(model)) if posture is None else np.asarray(posture, dtype=float)
+    body = observed(model, observations)
+    rest = body.neutral() if posture is None else np.asarray(posture, dtype=float)
     pull = _posture(body, posture_sd)
     q = _frame_by_frame(body, observations, rest, pull)
     variance = _information_variance(body, q, pull)
     jerk, _ = jerk_scale(_unrolled(body, q), variance, dt, bandwidth)
-    q, Q, qd2, qdd2 = _smooth(body, q, rest, pull, jerk, dt)
-    v, a = _derivatives(body, q, dt)
+    q, Q, qd2, A = _smooth(body, q, rest, pull, jerk, dt)
+    v, a = body.derivatives(q, dt)
     good = _told(body, q, pull, variance, round(max_gap / dt))
     good[[0, -1]] = False
     q, v, a = (np.where(good[:, None], x, np.nan) for x in (q, v, a))
     ratio, worst = _fit(body, observations, q, Q, good)
     return BodyState(
-        t, q, v, a, np.diagonal(Q, axis1=1, axis2=2).copy(), qd2, qdd2, Q, good, ratio, worst, jerk
+        t, q, v, a, np.diagonal(Q, axis1=1, axis2=2).copy(), qd2, np.diagonal(A, axis1=1, axis2=2).copy(), Q, A, good, ratio, worst, jerk
     )  # fmt: skip
+
+
+def configurations(
+    model: Any,
+    observations: BodyObservations,
+    *,
+    posture: FloatArray | None = None,
+    posture_sd: float = POSTURE_SD,
+) -> FloatArray:
+    """Configurations (n, nq) frame by frame, without a motion prior: what inverse kinematics usually is."""
+    body = observed(model, observations)
+    rest = body.neutral() if posture is None else np.asarray(posture, dtype=float)
+    return _frame_by_frame(body, observations, rest, _posture(body, posture_sd))
 
 
 def solve_posture(
     model: Any, observations: BodyObservations, posture: FloatArray, posture_sd: float
 ) -> FloatArray:
     """The configuration (nq,) of one frame, with the joints near to a known posture."""
-    body = ObservedBody(model, observations)
+    body = observed(model, observations)
     found: FloatArray = _first(body, 0, posture, _posture(body, posture_sd))
     return found
 
 
-def _posture(body: ObservedBody, sd: float) -> FloatArray:
+def _posture(body: Observed, sd: float) -> FloatArray:
     """Information (nv,) of the posture about every component; none about where the body is."""
-    out = np.full(body.model.nv, sd**-2)
-    if body.floating:
-        out[:6] = 0.0
+    out = np.full(body.nv, sd**-2)
+    out[body.root] = 0.0
+    out[body.still] = _HELD
     return out
 
 
@@ -152,7 +163,7 @@ def _posture(body: ObservedBody, sd: float) -> FloatArray:
 
 
 def _frame_by_frame(
-    body: ObservedBody, observations: BodyObservations, rest: FloatArray, pull: FloatArray
+    body: Observed, observations: BodyObservations, rest: FloatArray, pull: FloatArray
 ) -> FloatArray:
     count = len(observations)
     seen = np.isfinite(observations.markers).all(axis=2).sum(axis=1)
@@ -181,68 +192,20 @@ def _frame_by_frame(
     return np.asarray(q)
 
 
-def _first(body: ObservedBody, frame: int, rest: FloatArray, pull: FloatArray) -> FloatArray:
+def _first(body: Observed, frame: int, rest: FloatArray, pull: FloatArray) -> FloatArray:
     """One frame from nothing: the whole body laid onto what is seen, then all joints."""
-    q = rest[None].copy()
     part = slice(frame, frame + 1)
-    if body.floating:
-        seen = body.observations
-        here, there = body.markers(q)[0], seen.markers[frame]
-        if seen.posed:
-            R, p = body.poses(q)
-            tips = np.concatenate([np.zeros((1, 3)), 0.1 * np.eye(3)])
-            here = np.concatenate([here, (p[0][:, None] + tips @ np.swapaxes(R[0], 1, 2)).reshape(-1, 3)])
-            measured = seen.p[frame][:, None] + tips @ np.swapaxes(seen.R[frame], 1, 2)
-            there = np.concatenate([there, measured.reshape(-1, 3)])
-        both = np.isfinite(there).all(axis=1)
-        R_w_b, p_w_b = _align(here[both], there[both])
-        root = lie.quaternion_wxyz_to_matrix(np.roll(q[:, 3:7], 1, axis=1))[0]
-        q[0, :3] = R_w_b @ q[0, :3] + p_w_b
-        q[0, 3:7] = np.roll(lie.matrix_to_quaternion_wxyz((R_w_b @ root)[None])[0], -1)
-    near = _nearest_angles(body, _iterate(body, q, part, rest, pull, _STEPS), rest)
+    tried = []
+    for start in body.starts(frame, rest):
+        q = _iterate(body, start[None], part, rest, pull, _STEPS)
+        tried.append((float(_normal(body, q, part, rest, pull)[2][0]), q))
+    q = min(tried, key=lambda one: one[0])[1]
+    near = body.nearest(q, rest)
     return np.asarray(_iterate(body, near, part, rest, pull, _STEPS)[0])
 
 
-def _nearest_angles(body: ObservedBody, q: FloatArray, rest: FloatArray) -> FloatArray:
-    """The same orientations with the angles nearest to the posture: three hinges about x, y and z have two sets of them."""
-    model = body.model
-    out = q.copy()
-    hinges = [
-        i
-        for i in range(1, model.njoints)
-        if model.joints[i].nq == 1 and "P" not in model.joints[i].shortname()[10:]
-    ]
-    at = {i: int(model.joints[i].idx_q) for i in hinges}
-    for k in at.values():
-        out[:, k] -= 2.0 * np.pi * np.round((out[:, k] - rest[k]) / (2.0 * np.pi))
-    for a, b, c in zip(hinges, hinges[1:], hinges[2:], strict=False):
-        names = [model.joints[i].shortname().removeprefix("JointModel") for i in (a, b, c)]
-        together = all(
-            model.parents[low] == high
-            and np.allclose(model.jointPlacements[low].homogeneous, np.eye(4), atol=1e-9)
-            for high, low in ((a, b), (b, c))
-        )
-        if not together or len(set(names)) != 3 or not set(names) <= {"RX", "RY", "RZ"}:
-            continue
-        three = [at[a], at[b], at[c]]
-        x, y, z = out[:, three].T
-        other = np.column_stack([x + np.pi, np.pi - y, z + np.pi])
-        other -= 2.0 * np.pi * np.round((other - rest[three]) / (2.0 * np.pi))
-        nearer = np.abs(other - rest[three]).sum(axis=1) < np.abs(out[:, three] - rest[three]).sum(axis=1)
-        out[:, three] = np.where(nearer[:, None], other, out[:, three])
-    return out
-
-
-def _align(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """R, p with ``b = R a + p`` (Kabsch)."""
-    ca, cb = a.mean(axis=0), b.mean(axis=0)
-    U, _, V = np.linalg.svd((b - cb).T @ (a - ca))
-    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ V)]) @ V
-    return R, cb - R @ ca
-
-
 def _iterate(
-    body: ObservedBody, q: FloatArray, part: slice, rest: FloatArray, pull: FloatArray, steps: int
+    body: Observed, q: FloatArray, part: slice, rest: FloatArray, pull: FloatArray, steps: int
 ) -> FloatArray:
     """Levenberg-Marquardt on every frame of a stretch, each with a damping of its own."""
     damping = np.full(len(q), 1e-6)
@@ -269,14 +232,14 @@ def _iterate(
 
 
 def _normal(
-    body: ObservedBody, q: FloatArray, part: slice, rest: FloatArray, pull: FloatArray
+    body: Observed, q: FloatArray, part: slice, rest: FloatArray, pull: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Information (n, nv, nv), gradient (n, nv) and cost (n,)."""
     r, J = body.residuals(q, part)
     JT = np.swapaxes(J, 1, 2)
     H, g = JT @ J, (JT @ r[..., None])[..., 0]
     off = body.difference(np.broadcast_to(rest, q.shape), q)
-    beyond, tight = _limits(body, q)
+    beyond, tight = body.limits(q)
     H[:, np.arange(H.shape[1]), np.arange(H.shape[1])] += pull + tight
     g += pull * off + tight * beyond
     cost: FloatArray = 0.5 * (
@@ -285,24 +248,7 @@ def _normal(
     return H, g, cost
 
 
-def _limits(body: ObservedBody, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """How far (n, nv) hinges are beyond their limits, and the information (n, nv) that pulls them back."""
-    model = body.model
-    beyond = np.zeros((q.shape[0], model.nv))
-    for i in range(1, model.njoints):
-        joint = model.joints[i]
-        if joint.nq != 1:
-            continue
-        iq, iv = int(joint.idx_q), int(joint.idx_v)
-        low, high = float(model.lowerPositionLimit[iq]), float(model.upperPositionLimit[iq])
-        if not low < high or high - low > 2.0 * np.pi - 1e-6:
-            continue
-        x = q[:, iq]
-        beyond[:, iv] = np.maximum(x - high, 0.0) + np.minimum(x - low, 0.0)
-    return beyond, np.where(beyond != 0.0, LIMIT_SD**-2, 0.0)
-
-
-def _information_variance(body: ObservedBody, q: FloatArray, pull: FloatArray) -> FloatArray:
+def _information_variance(body: Observed, q: FloatArray, pull: FloatArray) -> FloatArray:
     """Median variance (nv,) of the configurations found frame by frame."""
     every = slice(0, len(q), max(1, len(q) // 50))
     r, J = body.residuals(q[every], every)
@@ -312,7 +258,7 @@ def _information_variance(body: ObservedBody, q: FloatArray, pull: FloatArray) -
     return np.asarray(np.median(np.diagonal(np.linalg.inv(H[seen]), axis1=1, axis2=2), axis=0))
 
 
-def _told(body: ObservedBody, q: FloatArray, pull: FloatArray, usual: FloatArray, most: int) -> BoolArray:
+def _told(body: Observed, q: FloatArray, pull: FloatArray, usual: FloatArray, most: int) -> BoolArray:
     """Frames of which every component is seen, or was hidden for no more than `most` frames."""
     unseen = np.empty((len(q), usual.size), dtype=bool)
     for low in range(0, len(q), _CHUNK):
@@ -331,7 +277,7 @@ def _told(body: ObservedBody, q: FloatArray, pull: FloatArray, usual: FloatArray
     return np.asarray(~lost.any(axis=1))
 
 
-def _unrolled(body: ObservedBody, q: FloatArray) -> FloatArray:
+def _unrolled(body: Observed, q: FloatArray) -> FloatArray:
     """Coordinates (n, nv) whose differences are those on the manifold."""
     steps = body.difference(q[:-1], q[1:])
     return np.concatenate([np.zeros((1, steps.shape[1])), np.cumsum(steps, axis=0)])
@@ -341,11 +287,11 @@ def _unrolled(body: ObservedBody, q: FloatArray) -> FloatArray:
 
 
 def _smooth(
-    body: ObservedBody, q: FloatArray, rest: FloatArray, pull: FloatArray, jerk: FloatArray, dt: float
+    body: Observed, q: FloatArray, rest: FloatArray, pull: FloatArray, jerk: FloatArray, dt: float
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     count = len(q)
-    out, nv = q.copy(), body.model.nv
-    Q, qd2, qdd2 = np.empty((count, nv, nv)), np.empty((count, nv)), np.empty((count, nv))
+    out, nv = q.copy(), body.nv
+    Q, qd2, A = np.empty((count, nv, nv)), np.empty((count, nv)), np.empty((count, nv, nv))
     step = WINDOW - 2 * OVERLAP
     for begin in range(0, count, step) if count > WINDOW else (0,):
         low, high = max(0, begin - OVERLAP), min(count, begin + step + OVERLAP)
@@ -354,12 +300,12 @@ def _smooth(
         part, C, v2, a2 = _smooth_window(body, q[low:high], slice(low, high), rest, pull, jerk, dt)
         keep = slice(begin, min(count, begin + step) if count > WINDOW else count)
         inside = slice(keep.start - low, keep.stop - low)
-        out[keep], Q[keep], qd2[keep], qdd2[keep] = part[inside], C[inside], v2[inside], a2[inside]
-    return out, Q, qd2, qdd2
+        out[keep], Q[keep], qd2[keep], A[keep] = part[inside], C[inside], v2[inside], a2[inside]
+    return out, Q, qd2, A
 
 
 def _smooth_window(
-    body: ObservedBody,
+    body: Observed,
     q: FloatArray,
     part: slice,
     rest: FloatArray,
@@ -371,7 +317,7 @@ def _smooth_window(
 
     Steps of rotations are taken to add up, which they do to first order in the turn of one frame.
     """
-    count, nv = len(q), body.model.nv
+    count, nv = len(q), body.nv
     # The posture is known once, not anew in every frame.
     once = pull / count
     weight = jerk**-2.0
@@ -432,40 +378,28 @@ def _assemble(H: FloatArray, band: FloatArray, weight: FloatArray, blocks: int) 
 def _marginals(
     system: BlockTridiagonal, count: int, nv: int, dt: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Covariances of configurations and variances of velocities and accelerations."""
+    """Covariances of configurations, variances of velocities and covariances of accelerations."""
     Z, up = system.inverse_band()
     Z, up = Z.reshape(-1, 3, nv, 3, nv), up.reshape(-1, 3, nv, 3, nv)
 
-    def own(i: int, j: int) -> FloatArray:
-        """Variances (nv,) between frames i <= j."""
+    def block(i: int, j: int) -> FloatArray:
+        """Covariance (nv, nv) between frames i <= j."""
         (b, r), (c, s) = divmod(i, 3), divmod(j, 3)
-        return np.asarray(np.einsum("ii->i", Z[b, r, :, s, :] if b == c else up[b, r, :, s, :]))
+        return np.asarray(Z[b, r, :, s, :] if b == c else up[b, r, :, s, :])
 
-    Q = np.array([Z[k // 3, k % 3, :, k % 3, :] for k in range(count)])
-    v2, a2 = np.empty((count, nv)), np.empty((count, nv))
+    Q = np.array([block(k, k) for k in range(count)])
+    v2, A = np.empty((count, nv)), np.empty((count, nv, nv))
     for k in range(count):
         m = min(max(k, 1), count - 2)
-        A, B, C = own(m - 1, m - 1), own(m, m), own(m + 1, m + 1)
-        AB, BC, AC = own(m - 1, m), own(m, m + 1), own(m - 1, m + 1)
-        v2[k] = (A + C - 2.0 * AC) / (4.0 * dt**2)
-        a2[k] = (A + 4.0 * B + C - 4.0 * AB - 4.0 * BC + 2.0 * AC) / dt**4
-    return Q, v2, a2
-
-
-def _derivatives(body: ObservedBody, q: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
-    steps = body.difference(q[:-1], q[1:])
-    v, a = np.zeros((len(q), body.model.nv)), np.zeros((len(q), body.model.nv))
-    v[1:-1] = 0.5 * (steps[1:] + steps[:-1]) / dt
-    a[1:-1] = (steps[1:] - steps[:-1]) / dt**2
-    v[[0, -1]], a[[0, -1]] = v[[1, -2]], a[[1, -2]]
-    if body.floating:
-        wxyz = np.roll(q[:, 3:7], 1, axis=1)
-        _, v[:, :6], a[:, :6] = free_flyer(q[:, :3], wxyz, v[:, :3], v[:, 3:6], a[:, :3], a[:, 3:6])
-    return v, a
+        last, next_, apart = block(m - 1, m), block(m, m + 1), block(m - 1, m + 1)
+        v2[k] = np.diagonal(Q[m - 1] + Q[m + 1] - 2.0 * apart) / (4.0 * dt**2)
+        mixed = apart - 2.0 * (last + next_)
+        A[k] = (Q[m - 1] + 4.0 * Q[m] + Q[m + 1] + mixed + mixed.T) / dt**4
+    return Q, v2, A
 
 
 def _fit(
-    body: ObservedBody, observations: BodyObservations, q: FloatArray, Q: FloatArray, good: BoolArray
+    body: Observed, observations: BodyObservations, q: FloatArray, Q: FloatArray, good: BoolArray
 ) -> tuple[float, tuple[str, float]]:
     """How well what was seen fits, in its own standard deviations, and what fits worst."""
     frames = np.flatnonzero(good)

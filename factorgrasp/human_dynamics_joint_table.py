@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -21,8 +21,8 @@ DERIVATIVES: Mapping[int, tuple[str, ...]] = {
     1: ("_qd", "_dq", "_vel", "_velocity"), 2: ("_qdd", "_ddq", "_acc", "_acceleration")
 }  # fmt: skip
 """Endings of columns with a joint's velocity and acceleration."""
-# Beyond a joint's limits by so much is no rounding and no loose model, but another unit or another joint.
-_BEYOND = 1.0
+BEYOND = 1.0
+"""rad: beyond a joint's limits by so much is no rounding and no loose model, but another unit or another joint."""
 # Hinges without limits: people's joints turn less than one turn.
 _WITHOUT_LIMITS = 2.0 * np.pi
 _UNLIMITED = 100.0
@@ -82,7 +82,7 @@ def read_joint_table(
             )
     others = get(motion, "others", Literal["required", "zero"], where, "required")
     path = base_dir / get(motion, "file", str, where)
-    t, columns = _columns(path, motion)
+    t, columns = read_columns(path, motion)
     numbered = {name: f"q{k}" for k, name in enumerate(joints, start=1)}
     if "q1" in columns and not set(joints) & set(columns):
         renamed = {**numbered, **renamed}
@@ -194,7 +194,7 @@ def _check_angles(model: Any, name: str, values: FloatArray, field: str) -> None
     if not -_UNLIMITED < low < high < _UNLIMITED:
         low, high = -_WITHOUT_LIMITS, _WITHOUT_LIMITS
     good = values[np.isfinite(values)]
-    beyond = (good < low - _BEYOND) | (good > high + _BEYOND)
+    beyond = (good < low - BEYOND) | (good > high + BEYOND)
     if beyond.any():
         worst = float(good[np.argmax(np.abs(good))])
         raise InputError(
@@ -224,11 +224,14 @@ def _hinges(model: Any) -> list[str]:
     return out
 
 
-def _columns(path: Path, motion: Mapping[str, Any]) -> tuple[FloatArray, Mapping[str, FloatArray]]:
+def read_columns(
+    path: Path, motion: Mapping[str, Any], lengths: Sequence[str] = ()
+) -> tuple[FloatArray, Mapping[str, FloatArray]]:
+    """Times and columns of a table, or of an OpenSim storage in which `lengths` and the `translations` of [motion] are no angles."""
     if path.suffix.lower() in (".mot", ".sto"):
-        lengths = get(motion, "translations", tuple[str, ...], "[motion]", ())
+        stated = get(motion, "translations", tuple[str, ...], "[motion]", ())
         # A unit quaternion has no unit: its columns are no angles.
-        table = read_coordinates(path, (*lengths, *POSITION, *QUATERNION))
+        table = read_coordinates(path, (*stated, *lengths, *POSITION, *QUATERNION))
         return table.t, {name: table.values[:, k] for k, name in enumerate(table.names)}
     if "translations" in motion:
         raise InputError("[motion] translations", "a .mot or .sto file", path.name)

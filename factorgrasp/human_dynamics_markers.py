@@ -15,11 +15,13 @@ from factorgrasp.body_state import MAX_GAP, POSTURE_SD, BodyState, estimate_stat
 from factorgrasp.errors import InputError
 from factorgrasp.human_dynamics_joint_table import check_stamps
 from factorgrasp.models.human import HumanBody, configuration
-from factorgrasp.problems.body_observations import BodyObservations, ObservedBody, Placement, poses_only
+from factorgrasp.models.osim import GROUND, OsimModel
+from factorgrasp.problems.body_observations import BodyObservations, Placement, poses_only
 from factorgrasp.problems.human_dynamics_settings import PerName
 from factorgrasp.problems.link_motion import StateNoise
 from factorgrasp.problems.link_motion_files import link_poses
 from factorgrasp.problems.link_motion_pinocchio import PinocchioTree
+from factorgrasp.problems.observed_osim import observed
 from factorgrasp.recordings.opensim import MarkerRecording, read_osim_markers, read_trc
 from factorgrasp.signals import resample_rotations, resample_uniform
 from factorgrasp.toml_tables import check_keys, close_matches, convert, get, place, sub_table
@@ -32,6 +34,8 @@ _MARKERS = (*_COMMON, "markers", "marker_sd", "static", "static_posture", "stati
 _POSES = (*_COMMON, "bodies", "position_sd", "orientation_sd", "grf")
 _FITS = 3.0
 Vector = tuple[float, float, float]
+Stated = dict[str, tuple[str, Vector | None, float | None]]
+"""Marker to its link, its position there (m) and its sd (m), as far as they are said."""
 
 
 def from_observations(
@@ -41,9 +45,9 @@ def from_observations(
 
     Parameters
     ----------
-    model : pinocchio.Model
+    model : pinocchio.Model or OsimModel
     body : HumanBody or None
-        Its own markers are known by name.
+        Its own markers are known by name, as those of an OpenSim model are.
     motion : mapping
         The table [motion].
     file : Path
@@ -59,7 +63,12 @@ def from_observations(
     """
     if file.suffix.lower() == ".trc":
         check_keys(motion, _MARKERS, "[motion]")
-        observations, t = _markers(model, body, motion, file, base_dir)
+        own: Stated = {}
+        if isinstance(model, OsimModel):
+            own = {name: (link, _vector(point), None) for name, (link, point) in model.markers.items()}
+        elif body is not None:
+            own = {name: (link, _vector(point), None) for name, (link, point) in body.markers.items()}
+        observations, t = _markers(model, own, motion, file, base_dir)
     else:
         check_keys(motion, _POSES, "[motion]")
         observations, t = _poses(model, motion, file)
@@ -80,11 +89,11 @@ def from_observations(
 
 
 def _markers(
-    model: Any, body: HumanBody | None, motion: Mapping[str, Any], file: Path, base_dir: Path
+    model: Any, own: Stated, motion: Mapping[str, Any], file: Path, base_dir: Path
 ) -> tuple[BodyObservations, FloatArray]:
     seen = read_trc(file)
     check_stamps(seen.t, file)
-    stated = _placements(motion, body, base_dir)
+    stated = _placements(motion, own, base_dir)
     at = _matched(stated, seen, file)
     sd = _positive(motion, "marker_sd", MARKER_SD)
     names = list(at)
@@ -126,20 +135,16 @@ def _matched(stated: Mapping[str, Any], seen: MarkerRecording, file: Path) -> di
     return at
 
 
-Stated = dict[str, tuple[str, Vector | None, float | None]]
-
-
-def _placements(motion: Mapping[str, Any], body: HumanBody | None, base_dir: Path) -> Stated:
+def _placements(motion: Mapping[str, Any], own: Stated, base_dir: Path) -> Stated:
     """Marker to its link, its position there, and its sd, from [motion.markers] or from a file."""
     value = motion.get("markers")
     where = "[motion.markers]"
     if value is None:
-        if body is None:
+        if not own:
             raise InputError(
                 "[motion] markers", "where markers sit: a table, or a .toml or .osim file", "no such key"
             )
-        own = {name: (link, [float(x) for x in point]) for name, (link, point) in body.markers.items()}
-        return {name: (link, (p[0], p[1], p[2]), None) for name, (link, p) in own.items()}
+        return own
     if isinstance(value, str):
         path = base_dir / value
         where = path.name
@@ -220,7 +225,7 @@ def _calibrated(
     anchor[~known] = np.nan
     sd = _positive(motion, "static_posture_sd", 0.05)
     q = solve_posture(model, BodyObservations(placement, anchor[None]), posture, sd)
-    R, p = ObservedBody(model, BodyObservations(placement, mean[None])).link_axes(q[None])
+    R, p = observed(model, BodyObservations(placement, mean[None])).link_axes(q[None])
     own = np.einsum("mji,mj->mi", R[0], mean - p[0])
     position = np.where(known[:, None], placement.position, own)
     return Placement(placement.names, placement.links, position, placement.sd)
@@ -285,11 +290,26 @@ def _uniform(t: FloatArray, position: FloatArray, motion: Mapping[str, Any]) -> 
 # ---- what follows -------------------------------------------------------------------------------------------------
 
 
+def _vector(point: FloatArray) -> Vector:
+    x, y, z = (float(value) for value in point)
+    return x, y, z
+
+
 def _posture(model: Any, motion: Mapping[str, Any], key: str) -> FloatArray:
     angles = {
         name: convert(value, float, f"[motion.{key}] {name}")
         for name, value in sub_table(motion, key).items()
     }
+    if isinstance(model, OsimModel):
+        unknown = [name for name in angles if name not in model.names]
+        if unknown:
+            raise InputError(
+                f"[motion.{key}] {unknown[0]}",
+                "a coordinate of the model",
+                "none",
+                close_matches(unknown[0], model.names),
+            )
+        return np.array([angles.get(one.name, one.default) for one in model.coordinates])
     try:
         return configuration(model, angles)
     except InputError as error:
@@ -316,7 +336,7 @@ def _say_how_it_fits(state: BodyState, file: Path) -> None:
 
 def _check_upright(model: Any, state: BodyState, gravity: Vector) -> None:
     """Refuse a person of our own body model who lies on the floor all along: the ground's upright axis is another one."""
-    if str(model.name) != "human" or not model.existFrame("Pelvis"):
+    if isinstance(model, OsimModel) or str(model.name) != "human" or not model.existFrame("Pelvis"):
         return
     q = state.q[state.good][:, 3:7]
     up = np.array(
@@ -339,18 +359,27 @@ def _check_upright(model: Any, state: BodyState, gravity: Vector) -> None:
 
 
 def state_noise(state: BodyState, tree: PinocchioTree) -> StateNoise:
-    """Variances of the configurations at the good frames, in the order that a link motion has; accelerations have theirs apart."""
-    variance = state.q_variance[state.good].copy()
+    """Noise of configurations and accelerations at the good frames, in the order and frames that a link motion has.
+
+    Accelerations keep their correlations: joints that take turns in an error, as vertebrae between two markers do, move nothing else.
+    """
+    at = tree.tangent_columns
+    Q, A = state.q_covariance[state.good], state.qdd_covariance[state.good]
     if tree.floating:
-        R = lie.quaternion_wxyz_to_matrix(np.roll(state.q[state.good, 3:7], 1, axis=1))
-        P = np.swapaxes(R, 1, 2) @ state.q_covariance[state.good, :3, :3] @ R
-        variance[:, :3] = np.diagonal(P, axis1=1, axis2=2)
-    return StateNoise(variance[:, tree.tangent_columns])
+        back = np.broadcast_to(np.eye(Q.shape[1]), Q.shape).copy()
+        turn = lie.quaternion_wxyz_to_matrix(np.roll(state.q[state.good, 3:7], 1, axis=1))
+        back[:, :3, :3] = np.swapaxes(turn, 1, 2)
+        Q, A = (back @ C @ np.swapaxes(back, 1, 2) for C in (Q, A))
+    Q = np.diagonal(Q, axis1=1, axis2=2)[:, at]
+    A = A[:, at][:, :, at]
+    return StateNoise(Q, acceleration=0.5 * (A + np.swapaxes(A, 1, 2)) + 1e-10 * np.eye(at.size))
 
 
 def _variances(model: Any, state: BodyState) -> dict[str, PerName]:
     """Variances of the accelerations of joints and of the root, medians over the recording."""
     middle = np.median(state.qdd_variance[state.good], axis=0)
+    if isinstance(model, OsimModel):
+        return _osim_variances(model, state, middle)
     tree = PinocchioTree(model)
     floating = tree.floating
     joints: dict[str, Any] = {
@@ -363,3 +392,20 @@ def _variances(model: Any, state: BodyState) -> dict[str, PerName]:
         linear = float(np.mean(middle[:3]))
         out["link_acceleration"] = tuple(float(max(v, 1e-10)) for v in (linear, linear, linear, *middle[3:6]))
     return out
+
+
+def _osim_variances(model: OsimModel, state: BodyState, middle: FloatArray) -> dict[str, PerName]:
+    at = {name: k for k, name in enumerate(model.names)}
+    joints = {
+        joint.name: tuple(float(max(middle[at[name]], 1e-8)) for name in joint.coordinates)
+        for joint in model.joints
+        if joint.parent != GROUND and joint.coordinates
+    }
+    root = next(joint for joint in model.joints if joint.parent == GROUND)
+    some = np.flatnonzero(state.good)[:: max(1, int(state.good.sum()) // 20)]
+    S = root.subspace(model.values(state.q[some]), some.size)
+    spread = np.mean(S**2 @ middle[[at[name] for name in root.coordinates]][None, :, None], axis=0)[:, 0]
+    return {
+        "joint_acceleration": {"default": 1e-3, **joints},
+        "link_acceleration": tuple(float(max(v, 1e-8)) for v in spread),
+    }

@@ -12,12 +12,15 @@ import numpy as np
 from factorgrasp import lie
 from factorgrasp.errors import InputError
 from factorgrasp.human_dynamics_joint_table import read_joint_table
+from factorgrasp.human_dynamics_osim import read_osim_motion
 from factorgrasp.models.anthropometry import Sex
 from factorgrasp.models.human import HumanBody, human_body, load_body
 from factorgrasp.models.joint_motion import differentiate_configurations
+from factorgrasp.models.osim import read_osim
 from factorgrasp.problems.human_dynamics_settings import PerName
 from factorgrasp.problems.link_motion import GRAVITY, LinkMotion
 from factorgrasp.problems.link_motion_files import is_link_archive, load_links, with_masses_of
+from factorgrasp.problems.link_motion_osim import from_osim
 from factorgrasp.problems.link_motion_pinocchio import PinocchioTree
 from factorgrasp.signals import resample_rotations, resample_uniform
 from factorgrasp.toml_tables import check_keys, get, place, sub_table
@@ -70,16 +73,18 @@ def read_body_motion(table: Mapping[str, Any], base_dir: Path) -> BodyMotion:
     file = base_dir / get(motion, "file", str, "[motion]") if "file" in motion else None
     archive = file is not None and is_link_archive(file)
     model = sub_table(table, "model", required=not archive)
-    ways = [key for key in ("links", "urdf", "height") if key in model]
+    ways = [key for key in ("links", "urdf", "osim", "height") if key in model]
     if len(ways) > 1 or (not ways and not archive):
         raise InputError(
             "[model]",
-            "one of: links (a motion file), urdf, or height with mass and sex",
+            "one of: links (a motion file), urdf, osim, or height with mass and sex",
             " and ".join(ways) or "none of them",
         )
     if not ways or ways[0] == "links":
         return _from_links(model, motion, base_dir)
     motion = sub_table(table, "motion", required=True)
+    if ways[0] == "osim":
+        return _from_osim(model, motion, base_dir)
     pin_model, base, body = read_model(model, base_dir)
     gravity = get(model, "gravity", Vector, "[model]", _GRAVITY_Y_UP if archive else GRAVITY)
     assert file is not None or "file" not in motion
@@ -114,6 +119,24 @@ def read_model(model: Mapping[str, Any], base_dir: Path) -> tuple[Any, str, Huma
     except InputError as error:
         raise InputError(place("[model]", error.field), error.expected, error.found, error.hint) from error
     return body.model(), "floating", body
+
+
+def _from_osim(model: Mapping[str, Any], motion: Mapping[str, Any], base_dir: Path) -> BodyMotion:
+    check_keys(model, ("osim", "gravity"), "[model]")
+    osim = read_osim(base_dir / get(model, "osim", str, "[model]"))
+    file = base_dir / get(motion, "file", str, "[motion]")
+    gravity = np.array(get(model, "gravity", Vector, "[model]", tuple(float(x) for x in osim.gravity)))
+    if file.suffix.lower() == ".trc":
+        from factorgrasp.human_dynamics_markers import from_observations
+
+        x, y, z = (float(v) for v in gravity)
+        state, variances = from_observations(osim, None, motion, file, base_dir, (x, y, z))
+        good = state.good
+        found = from_osim(osim, state.t[good], state.q[good], state.qd[good], state.qdd[good], gravity)
+        extras = {"q": state.q, "q_sd": np.sqrt(state.q_variance), "q_names": np.array(osim.names)}
+        return _known(state.t, good, found, variances, None, extras)
+    read = read_osim_motion(osim, motion, file, gravity)
+    return _known(read.clock, read.good, read.motion, read.variances)
 
 
 def _from_links(model: Mapping[str, Any], motion: Mapping[str, Any], base_dir: Path) -> BodyMotion:

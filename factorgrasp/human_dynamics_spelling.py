@@ -12,7 +12,7 @@ from typing import Any
 from factorgrasp.errors import InputError
 from factorgrasp.toml_tables import convert, describe, place
 
-_MODEL = {"motion": "links", "motion_file": "links", "gender": "sex", "base_type": "base"}
+_MODEL = {"opensim": "osim", "motion": "links", "motion_file": "links", "gender": "sex", "base_type": "base"}
 _MOTION = {
     "csv": "file", "trc": "file", "mot": "file", "sto": "file", "path": "file", "links": "file", "npz": "file",
     "frame_rate": "rate", "sampling_rate": "rate", "cutoff": "bandwidth", "cutoff_hz": "bandwidth", "bandwidth_hz": "bandwidth",
@@ -147,10 +147,14 @@ def _model(model: Mapping[str, Any]) -> dict[str, Any]:
                 raise InputError(f"[model] {key}", "the key once", "in anthropometry, too")
             out[key] = value
     if isinstance(out.get("file"), str):
-        kind = {".urdf": "urdf", ".xml": "urdf", ".npz": "links"}.get(PurePath(out["file"]).suffix.lower())
+        kind = {".urdf": "urdf", ".xml": "urdf", ".npz": "links", ".osim": "osim"}.get(
+            PurePath(out["file"]).suffix.lower()
+        )
         if kind is None:
             raise InputError(
-                "[model] file", "a .urdf file or an archive of link-level arrays (.npz)", repr(out["file"])
+                "[model] file",
+                "a .urdf or .osim file, or an archive of link-level arrays (.npz)",
+                repr(out["file"]),
             )
         if kind in out:
             raise InputError(f"[model] {kind}", "either file or " + kind, "both")

@@ -10,10 +10,14 @@ import numpy as np
 
 from factorgrasp import lie
 from factorgrasp.errors import InputError
+from factorgrasp.models.joint_motion import free_flyer
 from factorgrasp.problems.link_motion_check import check_names
 from factorgrasp.problems.link_motion_spatial import rotate
 from factorgrasp.toml_tables import close_matches
 from factorgrasp.typing import FloatArray, IntArray
+
+LIMIT_SD = 0.02
+"""Rad beyond a joint's limit that cost as much as one standard deviation."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,6 +146,15 @@ class ObservedBody:
             np.full(3 * k, 1.0 / observations.orientation_sd),
         ]
         self._weights = np.concatenate(weights)
+        self.nv = int(model.nv)
+        self.root = np.arange(6 if self.floating else 0)
+        self.still = np.zeros(self.nv, dtype=bool)
+
+    def neutral(self) -> FloatArray:
+        """The model's zero configuration (nq,)."""
+        import pinocchio as pin
+
+        return np.asarray(pin.neutral(self.model))
 
     def _points(
         self, links: Sequence[str], position: FloatArray, names: Sequence[str]
@@ -274,6 +287,90 @@ class ObservedBody:
                 lie.quaternion_multiply_wxyz(lie.quaternion_conjugate(a), b)
             )
         return out
+
+    def starts(self, frame: int, rest: FloatArray) -> list[FloatArray]:
+        """Where to start from nothing: the whole body in its posture, laid onto what is seen in a frame."""
+        q = rest[None].copy()
+        if self.floating:
+            seen = self.observations
+            here, there = self.markers(q)[0], seen.markers[frame]
+            if seen.posed:
+                R, p = self.poses(q)
+                tips = np.concatenate([np.zeros((1, 3)), 0.1 * np.eye(3)])
+                here = np.concatenate([here, (p[0][:, None] + tips @ np.swapaxes(R[0], 1, 2)).reshape(-1, 3)])
+                measured = seen.p[frame][:, None] + tips @ np.swapaxes(seen.R[frame], 1, 2)
+                there = np.concatenate([there, measured.reshape(-1, 3)])
+            both = np.isfinite(there).all(axis=1)
+            R_w_b, p_w_b = _align(here[both], there[both])
+            root = lie.quaternion_wxyz_to_matrix(np.roll(q[:, 3:7], 1, axis=1))[0]
+            q[0, :3] = R_w_b @ q[0, :3] + p_w_b
+            q[0, 3:7] = np.roll(lie.matrix_to_quaternion_wxyz((R_w_b @ root)[None])[0], -1)
+        return [q[0]]
+
+    def nearest(self, q: FloatArray, rest: FloatArray) -> FloatArray:
+        """The same orientations with the angles nearest to the posture: three hinges about x, y and z have two sets of them."""
+        model = self.model
+        out = q.copy()
+        hinges = [
+            i
+            for i in range(1, model.njoints)
+            if model.joints[i].nq == 1 and "P" not in model.joints[i].shortname()[10:]
+        ]
+        at = {i: int(model.joints[i].idx_q) for i in hinges}
+        for k in at.values():
+            out[:, k] -= 2.0 * np.pi * np.round((out[:, k] - rest[k]) / (2.0 * np.pi))
+        for a, b, c in zip(hinges, hinges[1:], hinges[2:], strict=False):
+            names = [model.joints[i].shortname().removeprefix("JointModel") for i in (a, b, c)]
+            together = all(
+                model.parents[low] == high
+                and np.allclose(model.jointPlacements[low].homogeneous, np.eye(4), atol=1e-9)
+                for high, low in ((a, b), (b, c))
+            )
+            if not together or len(set(names)) != 3 or not set(names) <= {"RX", "RY", "RZ"}:
+                continue
+            three = [at[a], at[b], at[c]]
+            x, y, z = out[:, three].T
+            other = np.column_stack([x + np.pi, np.pi - y, z + np.pi])
+            other -= 2.0 * np.pi * np.round((other - rest[three]) / (2.0 * np.pi))
+            nearer = np.abs(other - rest[three]).sum(axis=1) < np.abs(out[:, three] - rest[three]).sum(axis=1)
+            out[:, three] = np.where(nearer[:, None], other, out[:, three])
+        return out
+
+    def limits(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """How far (n, nv) hinges are beyond their limits, and the information (n, nv) that pulls them back."""
+        model = self.model
+        beyond = np.zeros((q.shape[0], model.nv))
+        for i in range(1, model.njoints):
+            joint = model.joints[i]
+            if joint.nq != 1:
+                continue
+            iq, iv = int(joint.idx_q), int(joint.idx_v)
+            low, high = float(model.lowerPositionLimit[iq]), float(model.upperPositionLimit[iq])
+            if not low < high or high - low > 2.0 * np.pi - 1e-6:
+                continue
+            x = q[:, iq]
+            beyond[:, iv] = np.maximum(x - high, 0.0) + np.minimum(x - low, 0.0)
+        return beyond, np.where(beyond != 0.0, LIMIT_SD**-2, 0.0)
+
+    def derivatives(self, q: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
+        """Velocities and accelerations (n, nv) of uniform configurations by central differences, as pinocchio has them."""
+        steps = self.difference(q[:-1], q[1:])
+        v, a = np.zeros((len(q), self.model.nv)), np.zeros((len(q), self.model.nv))
+        v[1:-1] = 0.5 * (steps[1:] + steps[:-1]) / dt
+        a[1:-1] = (steps[1:] - steps[:-1]) / dt**2
+        v[[0, -1]], a[[0, -1]] = v[[1, -2]], a[[1, -2]]
+        if self.floating:
+            wxyz = np.roll(q[:, 3:7], 1, axis=1)
+            _, v[:, :6], a[:, :6] = free_flyer(q[:, :3], wxyz, v[:, :3], v[:, 3:6], a[:, :3], a[:, 3:6])
+        return v, a
+
+
+def _align(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """R, p with ``b = R a + p`` (Kabsch)."""
+    ca, cb = a.mean(axis=0), b.mean(axis=0)
+    U, _, V = np.linalg.svd((b - cb).T @ (a - ca))
+    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ V)]) @ V
+    return R, cb - R @ ca
 
 
 def placement_of(markers: Mapping[str, tuple[str, Sequence[float], float]]) -> Placement:
