@@ -37,6 +37,10 @@ Kind = Literal["whole", "hidden", "split"]
 _MARGIN = 8
 _MOST_COMPONENTS = 200
 _MOST_EXAMINED = 40
+_ROUND = 1.15
+"""Elongation of what certainly is no half of a disc (1.9)."""
+_SURE = 3
+"""Whole markers of one size that settle it."""
 _MOST_FUZZY = 3.5
 """Size of a component relative to its sure inside from which only the inside is taken."""
 _FEW = 6
@@ -50,6 +54,8 @@ _WHOLE = (0.93, 1.30)
 """Area of a whole marker relative to what is expected."""
 _SHARES = (0.22, 3.6)
 """Area of anything that may be markers."""
+_POOR_SPLIT = 0.2
+"""Root mean square of alpha's residuals from which a blob is no union of markers."""
 _ROUGH = 0.33
 """px: an outline that fits that well about the centroid is that of a whole marker, no search needed."""
 _SHIFT = 0.12
@@ -101,6 +107,15 @@ class _Candidate:
     similarity: float
     depth: float
     depth_variance: float
+    near: FloatArray | None = None
+
+    def depth_at(self, centre: FloatArray, radius: float, correlated: float) -> tuple[float, float]:
+        """Depth and variance of the part of the blob about a centre, for markers that touch."""
+        if self.near is None:
+            return np.nan, np.nan
+        v, u = np.mgrid[0 : self.near.shape[0], 0 : self.near.shape[1]]
+        mask = (np.hypot(u - centre[0], v - centre[1]) < radius) & (self.soft.alpha > 0.5) & self.soft.window
+        return disc_depth(self.near, mask, centre, correlated)
 
 
 _Component = tuple[int, tuple[int, int, int, int, int]]
@@ -184,7 +199,13 @@ class BlobDetector:
         if z is not None and self.settings.region in ("auto", "depth"):
             table = fit_table(z)
         index = chroma_index(image, cv2)
-        blobs = self._detect(image, z, table, index, self._looks[self._look], cv2)
+        look = self._looks[self._look]
+        blobs = self._detect(image, z, table, index, look, cv2)
+        if table is not None and len(blobs) < 3 and blobs.rejected.get("on the table", 0) >= 3:
+            # A hand pressed flat on the table, or a plane that is the hand's: markers on it are markers if they are on skin and alike.
+            flat = self._detect(image, z, None, index, look, cv2)
+            if len(flat) > 3 and flat.kind.count("whole") > 3:
+                return flat
         if len(blobs) < _FEW:
             blobs = self._try_other_light(blobs, image, z, table, index, cv2)
         return blobs
@@ -270,7 +291,7 @@ class BlobDetector:
                 if table is not None and table.depth(corner + soft.centroid) - value < s.least_height:
                     rejected["on the table"] += 1
                     continue
-            out.append(_Candidate(soft, similarity, value, variance))
+            out.append(_Candidate(soft, similarity, value, variance, near))
         return out
 
     def _examine(
@@ -331,8 +352,10 @@ class BlobDetector:
         rejected["other colour"] += sum(c.similarity < alike for c in candidates)
         candidates = [c for c in candidates if c.similarity >= alike]
         scale = _scales(candidates)
-        expected = _consensus(candidates, scale)
-        if self.camera is not None and self.settings.marker_diameter > 0.0:
+        expected, votes = _consensus(candidates, scale)
+        # Several whole markers know their size better than the settings do.
+        sure = votes >= _SURE
+        if not sure and self.camera is not None and self.settings.marker_diameter > 0.0:
             known = palm_moment(candidates, self.camera, self.settings.marker_diameter)
             # Were most markers half hidden, they would agree on a size that is too small.
             if known is not None and (
@@ -343,7 +366,7 @@ class BlobDetector:
         for candidate, factor in zip(candidates, scale, strict=True):
             soft = candidate.soft
             moment = None if expected is None else expected / factor
-            most = self._largest(candidate)
+            most = np.inf if sure else self._largest(candidate)
             if moment is None and soft.area > 1.35 * most:
                 # Nothing to compare with: the known diameter bounds a marker, seen from whichever side.
                 moment = np.eye(2) * most / (4.0 * np.pi)
@@ -352,18 +375,19 @@ class BlobDetector:
                 if not _SHARES[0] <= share <= _SHARES[1]:
                     rejected["other size"] += 1
                     continue
-            if soft.area > 3.6 * most or soft.elongation > self.settings.greatest_elongation:
-                rejected["other shape"] += 1
-                continue
-            for found, kind in self._centres(soft, moment):
-                rows.append((soft.corner + found.centre, found.covariance, candidate, kind))
+            centres = [] if soft.area > _SHARES[1] * most else self._centres(soft, moment)
+            rejected["other shape"] += not centres
+            for found, kind in centres:
+                part = candidate
+                if kind == "split":
+                    radius = 0.9 * np.sqrt(soft.area / (np.pi * len(centres)))
+                    value = candidate.depth_at(found.centre, radius, self.settings.depth_correlation)
+                    part = replace(candidate, depth=value[0], depth_variance=value[1])
+                rows.append((soft.corner + found.centre, found.covariance, part, kind))
         rows.sort(key=lambda row: -row[2].similarity)
         rows = rows[: self.settings.most_blobs]
         depth = np.array([row[2].depth for row in rows], dtype=float)
         variance = np.array([row[2].depth_variance for row in rows], dtype=float)
-        # Of touching markers only the common disc was read.
-        split = np.array([row[3] == "split" for row in rows], dtype=bool)
-        variance = np.where(split, variance + 0.003**2, variance)
         return DetectedBlobs(
             np.array([row[0] for row in rows], dtype=float).reshape(-1, 2),
             np.array([row[1] for row in rows], dtype=float).reshape(-1, 2, 2),
@@ -384,16 +408,22 @@ class BlobDetector:
         return float(np.pi * radius**2 * self.camera.fx * self.camera.fy)
 
     def _centres(self, soft: SoftBlob, moment: FloatArray | None) -> list[tuple[FittedCentre, Kind]]:
-        """The centres in one blob, with covariances that hold for what was seen of them."""
+        """The centres in one blob, with covariances that hold for what was seen of them; none when it has no shape of markers."""
+        long = soft.elongation > self.settings.greatest_elongation
         floor = self.settings.centroid_sd**2 * np.eye(2)
         plain = FittedCentre(soft.centroid, soft.covariance + floor, 1.0, 0.0)
         if moment is not None:
             # A sliver may be hidden without being noticed.
             radius = float(np.linalg.det(4.0 * moment)) ** 0.25
             missing = max(0.98 - soft.area / (np.pi * radius**2), 0.0)
-            plain = replace(plain, covariance=plain.covariance + (0.4 * radius * missing) ** 2 * np.eye(2))
+            # A marker drawn out by motion blends with what is beside it.
+            drawn = 0.1 * radius * max(soft.elongation - 1.5, 0.0)
+            more = (0.4 * radius * missing) ** 2 + drawn**2
+            plain = replace(plain, covariance=plain.covariance + more * np.eye(2))
         if moment is None:
             # Nothing tells a part of a disc from a slanted one: an elongated blob may be either.
+            if long:
+                return []
             doubt = 0.08 * np.sqrt(soft.area) * max(soft.elongation - 1.3, 0.0)
             widened = FittedCentre(soft.centroid, plain.covariance + doubt**2 * np.eye(2), 1.0, 0.0)
             return [(widened, "whole")]
@@ -401,9 +431,11 @@ class BlobDetector:
         if share > 1.45:
             parts = split_blob(soft, moment, 2 if share < 2.45 else 3)
             apart = min(np.linalg.norm(a.centre - b.centre) for a in parts for b in parts if a is not b)
-            if apart > 0.7 * np.sqrt(soft.area / len(parts)):
+            if apart > 0.7 * np.sqrt(soft.area / len(parts)) and parts[0].rms < _POOR_SPLIT:
                 rest = self.settings.hidden_sd**2 * 0.4 * np.eye(2)
                 return [(FittedCentre(p.centre, p.covariance + rest, 1.0, p.rms), "split") for p in parts]
+        if long:
+            return []
         if _WHOLE[0] <= share <= _WHOLE[1] and outline_rms(soft.outline, moment, soft.centroid) < _ROUGH:
             return [(plain, "whole")]
         fitted = fit_outline(soft.outline, moment, soft.middle)
@@ -472,6 +504,8 @@ def _scales(candidates: list[_Candidate]) -> FloatArray:
 def _elliptic(soft: SoftBlob) -> bool:
     """Whether the outline of a blob is an ellipse, as that of a whole marker is."""
     rough = max(0.2, 0.045 * np.sqrt(soft.area))
+    if soft.elongation < _ROUND:
+        return True
     return soft.elongation < 2.5 and outline_rms(soft.outline, soft.moment, soft.middle) < rough
 
 
@@ -497,19 +531,22 @@ def palm_moment(candidates: list[_Candidate], camera: Camera, diameter: float) -
     return np.asarray(diameter**2 / 16.0 * J @ within @ J.T)
 
 
-def _consensus(candidates: list[_Candidate], scale: FloatArray) -> FloatArray | None:
-    """Second moment (2, 2) of a whole marker at the middle distance, from the size that most blobs share; None without one."""
+def _consensus(candidates: list[_Candidate], scale: FloatArray) -> tuple[FloatArray | None, int]:
+    """Second moment (2, 2) of a whole marker at the middle distance, from the size that most blobs share, and their number."""
     if len(candidates) < 2:
-        return None
+        return None, 0
     area = np.array([candidate.soft.area for candidate in candidates]) * scale
     round_ = np.array([_elliptic(candidate.soft) for candidate in candidates])
     if round_.sum() < 2:
-        return None
-    alike = (np.abs(np.log(area[:, None] / area[None])) < 0.22) & round_[:, None] & round_[None]
+        return None, 0
+    shape = np.array([c.soft.moment / np.sqrt(np.linalg.det(c.soft.moment)) for c in candidates])
+    # Halves of discs are as large as each other, but cut in different directions.
+    other = np.linalg.norm(shape[:, None] - shape[None], axis=(2, 3)) > 0.5
+    alike = (np.abs(np.log(area[:, None] / area[None])) < 0.22) & ~other & round_[:, None] & round_[None]
     votes = alike.sum(axis=1) + 1e-6 * area / area.max()
     best = int(np.argmax(votes))
     members = np.flatnonzero(alike[best])
     if members.size < 2:
-        return None
+        return None, 0
     moments = np.array([candidates[i].soft.moment * scale[i] for i in members])
-    return np.asarray(np.median(moments, axis=0))
+    return np.asarray(np.median(moments, axis=0)), int(members.size)
