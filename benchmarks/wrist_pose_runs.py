@@ -34,6 +34,7 @@ class Setting:
     layout_sd: float = 1e-3
     peers: bool = True
     association: str = "joint"
+    start_given: bool = False
 
 
 @dataclass
@@ -127,23 +128,27 @@ def run(setting: Setting, seed: int) -> Run:
         layout_sd=max(setting.layout_sd, 1e-6),
         **setting.options,
     )
-    return judge(setting, seed, recording)
+    start = None
+    if setting.start_given:
+        T = recording.truth.T_c_W0
+        start = CameraPose(T[:3, :3], T[:3, 3])
+    return judge(setting, seed, recording, start)
 
 
-def judge(setting: Setting, seed: int, recording: WristRecording, noise: WristNoise | None = None) -> Run:
+def judge(setting: Setting, seed: int, recording: WristRecording, given: CameraPose | None = None) -> Run:
     """The streaming estimator and its peers on one recording."""
     association = WristAssociation(method=setting.association)  # type: ignore[arg-type]
     estimator = OnlineWristPose(
-        recording.camera, recording.layout, association, noise, WristSettings(), late=0.3
+        recording.camera, recording.layout, association, WristNoise(), WristSettings(), given, late=0.3
     )
-    newest, final, wall, cpu, given = stream(recording, estimator)
+    newest, final, wall, cpu, markers = stream(recording, estimator)
     # A pose is judged where there was something to see; what is said about blackouts is judged apart.
     dark = np.zeros(len(recording.blobs), dtype=bool)
     for first, end in recording.sensing.blackouts:
         dark[first : end + 3] = True
     scores: dict[str, Score] = {}
     label = recording.label
-    wrong = int(np.count_nonzero((given > 0) & (given != label)))
+    wrong = int(np.count_nonzero((markers > 0) & (markers != label)))
     for name, by_time in (("newest", newest), ("lag 10", final)):
         e, P, _, _ = states(recording, by_time)
         scores[name] = score(e, P, ~dark)

@@ -72,6 +72,16 @@ class GemanMcClure:
         return 1.0 / (1.0 + (s / self.scale) ** 2) ** 2
 
 
+def inlier_weight(scale: float) -> float:
+    """Mean Geman-McClure weight of a residual of three rows that is as its covariance says.
+
+    Information weighted so is too small by this factor; a covariance that is to be honest is divided by it.
+    """
+    s = np.linspace(0.0, 8.0, 4001)
+    density = s**2 * np.exp(-0.5 * s**2)
+    return float(np.sum(density * GemanMcClure(scale).weight(s)) / np.sum(density))
+
+
 LOSSES: dict[str, type[Huber] | type[Cauchy] | type[GemanMcClure]] = {
     "huber": Huber,
     "cauchy": Cauchy,

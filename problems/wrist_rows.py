@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from factorgrasp.losses import GemanMcClure
+from factorgrasp.losses import GemanMcClure, inlier_weight
 from factorgrasp.models.camera import Camera
 from factorgrasp.problems.wrist_chain import Chain
 from factorgrasp.problems.wrist_model import NODE_SIZE, Pairs, motion_root, motion_rows, predict
@@ -92,7 +92,9 @@ class Batch:
         `extra` (M, 3, e) are whitened derivatives of the marker rows by further shared unknowns (a focal length), which stand last.
         """
         n, D = self.t.size, self.size
-        weights = self.weights(rows, loss)[:, None, None]
+        # Blobs as good as their covariance says count in full: the covariance of the pose is to be honest.
+        full = 1.0 if loss is None else 1.0 / inlier_weight(loss.scale)
+        weights = full * self.weights(rows, loss)[:, None, None]
         shared = 0 if layout_information is None else layout_information.shape[0]
         others = 0 if extra is None else extra.shape[2]
         diagonal, upper = np.zeros((n, D, D)), np.zeros((max(n - 1, 0), D, D))

@@ -30,9 +30,9 @@ class WristNoise:
     motion : {"acceleration", "jerk"}
         What is white noise: the acceleration (constant-velocity prior), or the jerk.
     translation_density : float or None
-        Square root of its spectral density: m/s^1.5 (acceleration) or m/s^2.5 (jerk). None: 1 or 15, adapted to the data if `adapt`.
+        Square root of its spectral density: m/s^1.5 (acceleration) or m/s^2.5 (jerk). None: 0.3 or 3, adapted to the data if `adapt`.
     rotation_density : float or None
-        rad/s^1.5 or rad/s^2.5. None: 3 or 45, adapted to the data if `adapt`.
+        rad/s^1.5 or rad/s^2.5. None: 1.5 or 15, adapted to the data if `adapt`.
     adapt : bool
         Fit densities that are None to the motion (expectation maximisation over the smoothed track).
     """
@@ -70,7 +70,7 @@ class WristNoise:
     @property
     def densities(self) -> FloatArray:
         """Spectral densities [rotation, translation] to begin with: squares of the two attributes or of their defaults."""
-        rotation, translation = (3.0, 1.0) if self.motion == "acceleration" else (45.0, 15.0)
+        rotation, translation = (1.5, 0.3) if self.motion == "acceleration" else (15.0, 3.0)
         return np.array([self.rotation_density or rotation, self.translation_density or translation]) ** 2
 
 

@@ -29,7 +29,7 @@ _RATE_FRAMES = 30.0
 _MEMORY_FRAMES = 300.0
 _MEMORY_SECONDS = 3.0
 _DENSITY_WEIGHT = 3.0
-_DENSITY_BOUNDS = (0.03, 30.0)
+_DENSITY_BOUNDS = (0.1, 100.0)
 _DECISIVE_FRAMES = 8
 """Frames in a row that have to decide between two poses before one of them is believed without reserve."""
 

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.linalg import lapack
 
 from factorgrasp import lie
+from factorgrasp.losses import inlier_weight
 from factorgrasp.models.camera import Camera
 from factorgrasp.problems.wrist_model import (
     NODE_SIZE,
@@ -108,6 +109,8 @@ class Window:
         self.covariance_newest: FloatArray = np.empty((0, 0))
         self.weights: FloatArray = np.empty(0)
         self.left = float("nan")
+        # Blobs as good as their covariance says should count in full, so that the covariance of the pose is honest.
+        self._inlier_scale = 1.0 / inlier_weight(self.loss_scale) if np.isfinite(self.loss_scale) else 1.0
         self._joined: tuple[IntArray, Pairs | None, IntArray]
 
     def __len__(self) -> int:
@@ -282,7 +285,7 @@ class Window:
         if not np.isfinite(self.loss_scale):
             return np.ones(r.shape[0])
         c2 = self.loss_scale**2
-        return np.asarray((c2 / (c2 + np.einsum("mi,mi->m", r, r))) ** 2)
+        return np.asarray(self._inlier_scale * (c2 / (c2 + np.einsum("mi,mi->m", r, r))) ** 2)
 
     def _join(self) -> None:
         """All pairs of the window as one, once a frame."""
