@@ -5,8 +5,9 @@ Needs OpenCV: ``pip install 'factorgrasp[vision]'``.
 
 from __future__ import annotations
 
+from factorgrasp.vision.blobs import DetectedBlobs
 from factorgrasp.vision.colour import ColourReference, learn_colour, read_colour
-from factorgrasp.vision.detector import BlobDetector, DetectedBlobs
+from factorgrasp.vision.detector import BlobDetector
 from factorgrasp.vision.frames import Frame, FrameSource, read_frames
 from factorgrasp.vision.propose import propose_colour
 from factorgrasp.vision.recording import detect_recording, propose_detector

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,8 +12,12 @@ from numpy.typing import ArrayLike
 from factorgrasp.errors import InputError
 from factorgrasp.models.camera import Camera
 from factorgrasp.typing import BoolArray, FloatArray
+from factorgrasp.vision.blob_centres import blob_centres
 from factorgrasp.vision.blob_depth import disc_depth
+from factorgrasp.vision.blob_sizes import area_scales, common_size, largest_area, palm_moment
+from factorgrasp.vision.blobs import Candidate, DetectedBlobs, Kind
 from factorgrasp.vision.colour import ColourReference
+from factorgrasp.vision.components import Component, find_components
 from factorgrasp.vision.images import (
     LOG_LIGHT,
     LOG_STEPS,
@@ -27,84 +30,21 @@ from factorgrasp.vision.images import (
 from factorgrasp.vision.images import middle as median
 from factorgrasp.vision.light import NOTICEABLE, light_shift, mean_chroma
 from factorgrasp.vision.opencv import load_cv2
-from factorgrasp.vision.outline_fit import FittedCentre, fit_outline, outline_rms, split_blob
 from factorgrasp.vision.settings import DetectorSettings
-from factorgrasp.vision.soft_blob import SoftBlob, soften
+from factorgrasp.vision.soft_blob import soften
 from factorgrasp.vision.table_plane import TablePlane, fit_table
 
-Kind = Literal["whole", "hidden", "split"]
-
 _MARGIN = 8
-_MOST_COMPONENTS = 200
 _MOST_EXAMINED = 40
-_MOST_FUZZY = 3.5
-"""Size of a component relative to its sure inside from which only the inside is taken."""
-_FEW = 6
-"""Blobs: with fewer, another lamp is considered."""
-_SEVERAL = 24
-"""px: a component of that size may be several markers."""
 _UNKNOWN_DEPTH_VARIANCE = 1.0
 _LEAST_ALIKE = 0.5
 """Similarity relative to the most similar blob: all markers are in the same light."""
-_WHOLE = (0.93, 1.30)
-"""Area of a whole marker relative to what is expected."""
 _SHARES = (0.22, 3.6)
 """Area of anything that may be markers."""
-_ROUGH = 0.33
-"""px: an outline that fits that well about the centroid is that of a whole marker, no search needed."""
-_SHIFT = 0.12
-"""px: a centroid that differs that much from the fitted outline's centre is that of a part of a marker."""
-
-
-@dataclass(frozen=True, eq=False)
-class DetectedBlobs:
-    """The blobs of one image, the most similar first.
-
-    Attributes
-    ----------
-    uv : ndarray, shape (k, 2)
-        px; the centre of the first pixel is (0, 0).
-    covariance_uv : ndarray, shape (k, 2, 2)
-        px^2.
-    depth : ndarray, shape (k,)
-        m, NaN where it is missing.
-    covariance_depth : ndarray, shape (k,)
-        m^2; 1 where the depth is missing.
-    similarity : ndarray, shape (k,)
-        Bhattacharyya coefficient with the reference colour.
-    area : ndarray, shape (k,)
-        px, of what is seen.
-    kind : tuple of {"whole", "hidden", "split"}
-        Whether the whole marker was seen, a part of it, or one that touches another.
-    rejected : mapping of str to int
-        Why other spots of the markers' colour are not among them.
-    table : TablePlane or None
-    """
-
-    uv: FloatArray
-    covariance_uv: FloatArray
-    depth: FloatArray
-    covariance_depth: FloatArray
-    similarity: FloatArray
-    area: FloatArray
-    kind: tuple[Kind, ...]
-    rejected: Mapping[str, int]
-    table: TablePlane | None = None
-
-    def __len__(self) -> int:
-        return int(self.uv.shape[0])
-
-
-@dataclass(frozen=True, eq=False)
-class _Candidate:
-    soft: SoftBlob
-    similarity: float
-    depth: float
-    depth_variance: float
-
-
-_Component = tuple[int, tuple[int, int, int, int, int]]
-"""Label, and (left, top, width, height, area)."""
+_SURE = 3
+"""Whole markers of one size that settle it."""
+_FEW = 6
+"""Blobs: with fewer, another lamp is considered."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,7 +124,13 @@ class BlobDetector:
         if z is not None and self.settings.region in ("auto", "depth"):
             table = fit_table(z)
         index = chroma_index(image, cv2)
-        blobs = self._detect(image, z, table, index, self._looks[self._look], cv2)
+        look = self._looks[self._look]
+        blobs = self._detect(image, z, table, index, look, cv2)
+        if table is not None and len(blobs) < 3 and blobs.rejected.get("on the table", 0) >= 3:
+            # A hand pressed flat on the table, or a plane that is the hand's: markers on it are markers if they are on skin and alike.
+            flat = self._detect(image, z, None, index, look, cv2)
+            if len(flat) > 3 and flat.kind.count("whole") > 3:
+                return flat
         if len(blobs) < _FEW:
             blobs = self._try_other_light(blobs, image, z, table, index, cv2)
         return blobs
@@ -222,11 +168,11 @@ class BlobDetector:
         reference: ColourReference,
         rejected: Counter[str],
         cv2: Any,
-    ) -> list[_Candidate]:
+    ) -> list[Candidate]:
         """Connected components that pass every test which needs no other blob."""
         s = self.settings
         most = int(s.largest_share * seeds.size)
-        labels, stats = _components(seeds, s.least_pixels, most, cv2)
+        labels, stats = find_components(seeds, s.least_pixels, most, cv2)
         if table is not None and stats:
             kept = self._clear_of(table, z, stats)
             rejected["on the table"] += len(stats) - len(kept)
@@ -270,7 +216,7 @@ class BlobDetector:
                 if table is not None and table.depth(corner + soft.centroid) - value < s.least_height:
                     rejected["on the table"] += 1
                     continue
-            out.append(_Candidate(soft, similarity, value, variance))
+            out.append(Candidate(soft, similarity, value, variance, near))
         return out
 
     def _examine(
@@ -297,7 +243,7 @@ class BlobDetector:
         similarity = reference.similarity(logs[:, 0] - logs[:, 1], logs[:, 2] - logs[:, 1])
         return inside, ring, window, similarity
 
-    def _clear_of(self, table: TablePlane, z: Any, stats: list[_Component]) -> list[_Component]:
+    def _clear_of(self, table: TablePlane, z: Any, stats: list[Component]) -> list[Component]:
         """Components but for those whose middle certainly is on the table: cheap, before any is examined."""
         boxes = np.array([box for _, box in stats])
         middle = boxes[:, :2] + boxes[:, 2:4] // 2
@@ -324,26 +270,28 @@ class BlobDetector:
         return bool(float(table.depth(middle)) - float(median(values)) > self.settings.least_height)
 
     def _finish(
-        self, candidates: list[_Candidate], rejected: Counter[str], table: TablePlane | None
+        self, candidates: list[Candidate], rejected: Counter[str], table: TablePlane | None
     ) -> DetectedBlobs:
         """Sizes compared with each other: what is whole, hidden, merged or no marker."""
         alike = max((c.similarity for c in candidates), default=0.0) * _LEAST_ALIKE
         rejected["other colour"] += sum(c.similarity < alike for c in candidates)
         candidates = [c for c in candidates if c.similarity >= alike]
-        scale = _scales(candidates)
-        expected = _consensus(candidates, scale)
-        if self.camera is not None and self.settings.marker_diameter > 0.0:
+        scale = area_scales(candidates)
+        expected, votes = common_size(candidates, scale)
+        # Several whole markers know their size better than the settings do.
+        sure = votes >= _SURE
+        if not sure and self.camera is not None and self.settings.marker_diameter > 0.0:
             known = palm_moment(candidates, self.camera, self.settings.marker_diameter)
             # Were most markers half hidden, they would agree on a size that is too small.
             if known is not None and (
                 expected is None or np.linalg.det(expected) < 0.6 * np.linalg.det(known)
             ):
                 expected = known
-        rows: list[tuple[FloatArray, FloatArray, _Candidate, Kind]] = []
+        rows: list[tuple[FloatArray, FloatArray, Candidate, Kind]] = []
         for candidate, factor in zip(candidates, scale, strict=True):
             soft = candidate.soft
             moment = None if expected is None else expected / factor
-            most = self._largest(candidate)
+            most = np.inf if sure else largest_area(candidate, self.camera, self.settings.marker_diameter)
             if moment is None and soft.area > 1.35 * most:
                 # Nothing to compare with: the known diameter bounds a marker, seen from whichever side.
                 moment = np.eye(2) * most / (4.0 * np.pi)
@@ -352,18 +300,19 @@ class BlobDetector:
                 if not _SHARES[0] <= share <= _SHARES[1]:
                     rejected["other size"] += 1
                     continue
-            if soft.area > 3.6 * most or soft.elongation > self.settings.greatest_elongation:
-                rejected["other shape"] += 1
-                continue
-            for found, kind in self._centres(soft, moment):
-                rows.append((soft.corner + found.centre, found.covariance, candidate, kind))
+            centres = [] if soft.area > _SHARES[1] * most else blob_centres(soft, moment, self.settings)
+            rejected["other shape"] += not centres
+            for found, kind in centres:
+                part = candidate
+                if kind == "split":
+                    radius = 0.9 * np.sqrt(soft.area / (np.pi * len(centres)))
+                    value = candidate.depth_at(found.centre, radius, self.settings.depth_correlation)
+                    part = replace(candidate, depth=value[0], depth_variance=value[1])
+                rows.append((soft.corner + found.centre, found.covariance, part, kind))
         rows.sort(key=lambda row: -row[2].similarity)
         rows = rows[: self.settings.most_blobs]
         depth = np.array([row[2].depth for row in rows], dtype=float)
         variance = np.array([row[2].depth_variance for row in rows], dtype=float)
-        # Of touching markers only the common disc was read.
-        split = np.array([row[3] == "split" for row in rows], dtype=bool)
-        variance = np.where(split, variance + 0.003**2, variance)
         return DetectedBlobs(
             np.array([row[0] for row in rows], dtype=float).reshape(-1, 2),
             np.array([row[1] for row in rows], dtype=float).reshape(-1, 2, 2),
@@ -376,79 +325,6 @@ class BlobDetector:
             table,
         )
 
-    def _largest(self, candidate: _Candidate) -> float:
-        """Area of a marker seen face on at the blob's depth, px; infinite when that is not known."""
-        if self.camera is None or not np.isfinite(candidate.depth) or self.settings.marker_diameter == 0.0:
-            return np.inf
-        radius = 0.5 * self.settings.marker_diameter / candidate.depth
-        return float(np.pi * radius**2 * self.camera.fx * self.camera.fy)
-
-    def _centres(self, soft: SoftBlob, moment: FloatArray | None) -> list[tuple[FittedCentre, Kind]]:
-        """The centres in one blob, with covariances that hold for what was seen of them."""
-        floor = self.settings.centroid_sd**2 * np.eye(2)
-        plain = FittedCentre(soft.centroid, soft.covariance + floor, 1.0, 0.0)
-        if moment is not None:
-            # A sliver may be hidden without being noticed.
-            radius = float(np.linalg.det(4.0 * moment)) ** 0.25
-            missing = max(0.98 - soft.area / (np.pi * radius**2), 0.0)
-            plain = replace(plain, covariance=plain.covariance + (0.4 * radius * missing) ** 2 * np.eye(2))
-        if moment is None:
-            # Nothing tells a part of a disc from a slanted one: an elongated blob may be either.
-            doubt = 0.08 * np.sqrt(soft.area) * max(soft.elongation - 1.3, 0.0)
-            widened = FittedCentre(soft.centroid, plain.covariance + doubt**2 * np.eye(2), 1.0, 0.0)
-            return [(widened, "whole")]
-        share = soft.area / float(4.0 * np.pi * np.sqrt(np.linalg.det(moment)))
-        if share > 1.45:
-            parts = split_blob(soft, moment, 2 if share < 2.45 else 3)
-            apart = min(np.linalg.norm(a.centre - b.centre) for a in parts for b in parts if a is not b)
-            if apart > 0.7 * np.sqrt(soft.area / len(parts)):
-                rest = self.settings.hidden_sd**2 * 0.4 * np.eye(2)
-                return [(FittedCentre(p.centre, p.covariance + rest, 1.0, p.rms), "split") for p in parts]
-        if _WHOLE[0] <= share <= _WHOLE[1] and outline_rms(soft.outline, moment, soft.centroid) < _ROUGH:
-            return [(plain, "whole")]
-        fitted = fit_outline(soft.outline, moment, soft.middle)
-        off = float(np.linalg.norm(fitted.centre - soft.centroid))
-        if share >= _WHOLE[0] - 0.1 and off < _SHIFT:
-            return [(plain, "whole")]
-        hidden = self.settings.hidden_sd**2 * np.eye(2)
-        return [(FittedCentre(fitted.centre, fitted.covariance + hidden, fitted.share, fitted.rms), "hidden")]
-
-
-def _components(seeds: Any, least: int, most: int, cv2: Any) -> tuple[Any, list[_Component]]:
-    """Connected components: labels (h, w), and label and (left, top, width, height, area) of each, the largest first.
-
-    A component with several sure insides, or one that is too large, falls into its sure insides: markers whose edges touch, or a
-    marker beside a large thing of a similar colour.
-    """
-    _, labels, stats, _ = cv2.connectedComponentsWithStatsWithAlgorithm(seeds, 8, cv2.CV_16U, cv2.CCL_BBDT)
-    area = stats[:, cv2.CC_STAT_AREA]
-    chosen = [int(label) for label in np.flatnonzero(area >= least) if label != 0]
-    chosen = sorted(chosen, key=lambda label: -int(area[label]))[:_MOST_COMPONENTS]
-    out = []
-    following = int(stats.shape[0])
-    for label in chosen:
-        left, top, width, height, count = (int(value) for value in stats[label])
-        box = (slice(top, top + height), slice(left, left + width))
-        if count >= _SEVERAL:
-            sure = ((labels[box] == label) & (seeds[box] == 2)).astype(np.uint8)
-            found, inner, parts, _ = cv2.connectedComponentsWithStatsWithAlgorithm(
-                sure, 8, cv2.CV_16U, cv2.CCL_BBDT
-            )
-            sound = [i for i in range(1, found) if parts[i, cv2.CC_STAT_AREA] >= max(least, 4)]
-            core = sum(int(parts[i, cv2.CC_STAT_AREA]) for i in sound)
-            # Grey cloth has the colour of a marker's edge, and joins the marker that it half hides.
-            fuzzy = count > most or count > _MOST_FUZZY * core
-            if sound and (len(sound) > 1 or fuzzy) and following + len(sound) < 60_000:
-                labels[box][labels[box] == label] = 0
-                for i in sound:
-                    labels[box][inner == i] = following
-                    x, y, w, h, n = (int(value) for value in parts[i])
-                    out.append((following, (left + x, top + y, w, h, n)))
-                    following += 1
-                continue
-        out.append((label, (left, top, width, height, count)))
-    return labels, sorted(out, key=lambda item: -item[1][4])
-
 
 def _kernel(cv2: Any, radius: int) -> Any:
     return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
@@ -458,58 +334,3 @@ def _on_skin(pixels: ByteImage) -> bool:
     """Whether most of the pixels are redder than blue, as skin of every tone is (and wood, and more)."""
     logs = LOG_LIGHT[pixels].astype(float) / LOG_STEPS
     return bool(np.mean(logs[:, 0] - logs[:, 2] > 0.2) > 0.5)
-
-
-def _scales(candidates: list[_Candidate]) -> FloatArray:
-    """Factor (k,) by which an area is to be multiplied to compare it with the others: they shrink with distance squared."""
-    depth = np.array([candidate.depth for candidate in candidates], dtype=float)
-    if not np.isfinite(depth).any():
-        return np.ones(depth.size)
-    middle = float(np.nanmedian(depth))
-    return np.asarray((np.where(np.isfinite(depth), depth, middle) / middle) ** 2)
-
-
-def _elliptic(soft: SoftBlob) -> bool:
-    """Whether the outline of a blob is an ellipse, as that of a whole marker is."""
-    rough = max(0.2, 0.045 * np.sqrt(soft.area))
-    return soft.elongation < 2.5 and outline_rms(soft.outline, soft.moment, soft.middle) < rough
-
-
-def palm_moment(candidates: list[_Candidate], camera: Camera, diameter: float) -> FloatArray | None:
-    """Second moment (2, 2) of a disc of known diameter that lies in the plane of the blobs, at their middle distance, px^2.
-
-    None unless four blobs with depth span a plane that the camera sees from above.
-    """
-    known = [c for c in candidates if np.isfinite(c.depth)]
-    if len(known) < 4:
-        return None
-    uv = np.array([c.soft.corner + c.soft.centroid for c in known])
-    points = camera.back_project(uv, np.array([c.depth for c in known]))
-    middle = np.median(points, axis=0)
-    _, spread, axes = np.linalg.svd(points - points.mean(axis=0))
-    if spread[1] < 0.01 or spread[2] > 0.4 * spread[1]:
-        return None
-    normal = axes[2]
-    if abs(normal @ middle) < 0.35 * np.linalg.norm(middle):
-        return None
-    _, J = camera.project_with_jacobian(middle)
-    within = np.eye(3) - np.outer(normal, normal)
-    return np.asarray(diameter**2 / 16.0 * J @ within @ J.T)
-
-
-def _consensus(candidates: list[_Candidate], scale: FloatArray) -> FloatArray | None:
-    """Second moment (2, 2) of a whole marker at the middle distance, from the size that most blobs share; None without one."""
-    if len(candidates) < 2:
-        return None
-    area = np.array([candidate.soft.area for candidate in candidates]) * scale
-    round_ = np.array([_elliptic(candidate.soft) for candidate in candidates])
-    if round_.sum() < 2:
-        return None
-    alike = (np.abs(np.log(area[:, None] / area[None])) < 0.22) & round_[:, None] & round_[None]
-    votes = alike.sum(axis=1) + 1e-6 * area / area.max()
-    best = int(np.argmax(votes))
-    members = np.flatnonzero(alike[best])
-    if members.size < 2:
-        return None
-    moments = np.array([candidates[i].soft.moment * scale[i] for i in members])
-    return np.asarray(np.median(moments, axis=0))

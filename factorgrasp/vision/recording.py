@@ -15,7 +15,8 @@ from factorgrasp.errors import InputError
 from factorgrasp.models.camera import Camera
 from factorgrasp.recordings.blobs import BlobRecording
 from factorgrasp.typing import FloatArray
-from factorgrasp.vision.detector import BlobDetector, DetectedBlobs
+from factorgrasp.vision.blobs import DetectedBlobs
+from factorgrasp.vision.detector import BlobDetector
 from factorgrasp.vision.propose import propose_colour
 from factorgrasp.vision.settings import DetectorSettings
 

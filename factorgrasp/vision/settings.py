@@ -55,7 +55,7 @@ class DetectorSettings:
     largest_share: float = 0.004
     greatest_elongation: float = 3.5
     least_height: float = 0.012
-    centroid_sd: float = 0.03
+    centroid_sd: float = 0.035
     hidden_sd: float = 0.10
     compression_sd: float = 0.2
     depth_correlation: float = 3.5

@@ -152,6 +152,35 @@ def test_nothing_is_found_where_nothing_is(reference: ColourReference) -> None:
     assert len(detector.detect(noise)) <= detector.settings.most_blobs
 
 
+def test_a_plane_that_is_the_hands_own_is_no_table(reference: ColourReference) -> None:
+    frame = hand(HandScene(distractors=False), seed=2)
+    flat = np.full(frame.depth.shape, DISTANCE)
+    blobs = BlobDetector(reference, camera=CAMERA).detect(frame.rgb, flat)
+    assert len(blobs) == 6
+    assert nearest(blobs, frame)[0].max() < 0.4
+
+
+@pytest.mark.parametrize("diameter", [0.006, 0.03, 0.0])
+def test_markers_of_another_size_than_said_are_found(reference: ColourReference, diameter: float) -> None:
+    frame = hand(seed=4)
+    blobs = BlobDetector(reference, DetectorSettings(marker_diameter=diameter), CAMERA).detect(
+        frame.rgb, frame.depth
+    )
+    assert len(blobs) == 6
+    assert nearest(blobs, frame)[0].max() < 0.3
+
+
+def test_most_markers_half_hidden_do_not_make_halves_whole(reference: ColourReference) -> None:
+    hidden = tuple(Hidden(marker, 0.5, angle=angle) for marker, angle in ((0, 3.5), (1, 2.0), (2, 0.9), (5, 4.6)))
+    frame = hand(HandScene(hidden=hidden), seed=0)
+    blobs = BlobDetector(reference, camera=CAMERA).detect(frame.rgb, frame.depth)
+    away, which = nearest(blobs, frame)
+    partly = (frame.visible > 0.3) & (frame.visible < 0.7)
+    assert partly.sum() >= 3
+    assert all(blobs.kind[which[i]] == "hidden" for i in np.flatnonzero(partly))
+    assert away[partly].max() < 0.8
+
+
 def test_images_that_do_not_fit_are_refused(reference: ColourReference) -> None:
     frame = hand()
     detector = BlobDetector(reference, camera=CAMERA)
