@@ -149,7 +149,7 @@ def test_joint_positions_through_a_urdf(recorded: Path, write: Callable[[str], P
         ("", r"kind: expected one of 'grasp_pose'.*; found no such key"),
         (
             'kind = "grasp_poes"',
-            r"kind: expected one of 'grasp_pose'.*; found 'grasp_poes'. Did you mean grasp_pose\?",
+            r"kind: expected one of 'grasp_pose'.*; found 'grasp_poes'. Did you mean grasp_pose",
         ),
         ("kind = 3", "kind: expected a string; found 3"),
         ('kind = "grasp_pose', "expected TOML; found "),

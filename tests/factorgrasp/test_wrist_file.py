@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import json
 import re
+import tomllib
 from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +19,7 @@ from factorgrasp.errors import InputError
 from factorgrasp.kinematics import isb_signs, range_of_motion
 from factorgrasp.lie import angle_between, quaternion_wxyz_to_matrix
 from factorgrasp.problem_file import load_problem
+from factorgrasp.problems.wrist_settings import WristAssociation, WristNoise, WristSettings
 from factorgrasp.recordings import read_poses, read_table
 from factorgrasp.simulation.wrist import WristRecording, cordella2014
 from factorgrasp.simulation.wrist_files import write_wrist_recording
@@ -462,3 +466,54 @@ def test_images_with_depth_to_the_pose(tmp_path: Path) -> None:
         result = run("solve", file)
         assert result.exit_code == 2
         assert words in result.stderr, result.stderr
+
+
+# ---- the documentation ---------------------------------------------------------------------------------------
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.mark.parametrize(
+    ("heading", "settings", "others"),
+    [
+        ("### `[association]`", WristAssociation, set()),
+        ("### `[noise]`", WristNoise, set()),
+        ("### `[estimate]`", WristSettings, {"method", "hand"}),
+    ],
+)
+def test_documented_keys_and_defaults(heading: str, settings: type[Any], others: set[str]) -> None:
+    """docs/wrist-pose.md has one row for every setting, with its default, and no others."""
+    text = (ROOT / "docs" / "wrist-pose.md").read_text(encoding="utf-8").split(heading)[1].split("\n##")[0]
+    cells = [line.split(" | ") for line in text.splitlines() if line.startswith("| `")]
+    documented = {row[0].split("`")[1]: row[1].strip("` ") for row in cells}
+    assert set(documented) == {field.name for field in fields(settings)} | others
+    for field in fields(settings):
+        shown = documented[field.name]
+        if field.default is None:
+            assert shown == "none", field.name
+        else:
+            assert tomllib.loads(f"value = {shown}")["value"] == field.default, field.name
+
+
+def test_documented_arrays(solved: tuple[Result, Path]) -> None:
+    text = (
+        (ROOT / "docs" / "wrist-pose.md")
+        .read_text(encoding="utf-8")
+        .split("## The answer")[1]
+        .split("`estimate.json` has")[0]
+    )
+    named = {
+        name
+        for line in text.splitlines()
+        if line.startswith("| `")
+        for name in re.findall(r"`(\w+)`", line.split(" | ")[0])
+    }
+    with np.load(solved[1] / "estimate.npz") as arrays:
+        assert named == set(arrays.files)
+
+
+def test_example_problem_file_loads(short: Path, tmp_path: Path) -> None:
+    (tmp_path / "blobs.csv").write_bytes((short / "blobs.csv").read_bytes())
+    file = tmp_path / "example.toml"
+    file.write_text((ROOT / "examples" / "wrist.toml").read_text(encoding="utf-8"), encoding="utf-8")
+    assert load_problem(file).title == "abduction and adduction, right hand"
