@@ -9,6 +9,7 @@ import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from importlib import import_module
 from typing import Any, ClassVar
 
 import numpy as np
@@ -214,10 +215,10 @@ def _callback_class() -> Callable[..., Any]:
     if _CALLBACK is None:
         import casadi
 
-        class Callback(casadi.Callback):  # type: ignore[misc]
+        class Callback(casadi.Callback):
             def __init__(self, oracle: _Oracle, name: str, ins: list[str], outs: list[str]) -> None:
                 casadi.Callback.__init__(self)
-                self.oracle, self.ins, self.outs = oracle, ins, outs
+                self.owner, self.ins, self.outs = oracle, ins, outs
                 self.construct(name, {})
 
             def get_n_in(self) -> int:
@@ -233,22 +234,22 @@ def _callback_class() -> Callable[..., Any]:
                 return self.outs[k].replace(":", "_")
 
             def get_sparsity_in(self, k: int) -> Any:
-                return self.oracle.sparsities[self.ins[k]]
+                return self.owner.sparsities[self.ins[k]]
 
             def get_sparsity_out(self, k: int) -> Any:
-                return self.oracle.sparsities[self.outs[k]]
+                return self.owner.sparsities[self.outs[k]]
 
             def eval(self, arguments: Sequence[Any]) -> list[Any]:
                 given = {key: value.full().ravel() for key, value in zip(self.ins, arguments, strict=True)}
                 try:
-                    return [self.oracle.value(key, given) for key in self.outs]
+                    return [self.owner.value(key, given) for key in self.outs]
                 except Exception as error:
                     # CasADi would print it and go on; the caller raises it again.
-                    self.oracle.failure = error
+                    self.owner.failure = error
                     raise
 
             def get_factory(self, name: str, ins: Sequence[str], outs: Sequence[str], aux: Any, options: Any) -> Any:  # fmt: skip
-                return self.oracle.make(name, ins, outs)
+                return self.owner.make(name, ins, outs)
 
         _CALLBACK = Callback
     return _CALLBACK
@@ -262,8 +263,7 @@ def _ones(matrix: sp.csc_array) -> sp.csc_array:
 
 
 def _pattern(matrix: sp.csc_array) -> Any:
-    import casadi
-
+    casadi: Any = import_module("casadi")
     return casadi.Sparsity(*matrix.shape, matrix.indptr.tolist(), matrix.indices.tolist())
 
 
