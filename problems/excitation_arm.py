@@ -117,10 +117,9 @@ def limits_of(model: Any, stated: Mapping[str, FloatArray | float | None]) -> Ro
         raise InputError(
             "robot.box_lower", "less than box_upper along every axis", f"{limits.box_lower.tolist()}"
         )
-    infinite = replace(limits)
     if limits.torque is not None:
-        infinite = replace(limits, torque=np.where(np.isfinite(limits.torque), limits.torque, 1e6))
-    return infinite
+        return replace(limits, torque=np.where(np.isfinite(limits.torque), limits.torque, 1e6))
+    return limits
 
 
 def tool_pose(model: Any, frame: str, q: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -136,7 +135,7 @@ def tool_pose(model: Any, frame: str, q: FloatArray) -> tuple[FloatArray, FloatA
 def follow(
     model: Any, frame: str, limits: RobotLimits, start: FloatArray, rotation: FloatArray, position: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Joint positions (nv, n) along poses ``R_w_r`` (n, 3, 3), ``p_w_r`` (n, 3), each from the one before, and the errors (n,) that are left.
+    """Joint positions (nv, n) along poses ``R_w_r`` (n, 3, 3), ``p_w_r`` (n, 3), each from the one before, and the errors (n,) left.
 
     Damped least squares within the position limits; what a redundant arm leaves open is drawn to the start.
     """
@@ -160,7 +159,9 @@ def follow(
             A = J @ J.T + damping * np.eye(6)
             step = J.T @ np.linalg.solve(A, error)
             pull = start - q
-            step += 0.05 * (pull - J.T @ np.linalg.solve(A, J @ pull))
+            if number < 5:
+                # Later it would only keep the pose from being met.
+                step += 0.05 * (pull - J.T @ np.linalg.solve(A, J @ pull))
             q = np.clip(q + step * min(1.0, 0.3 / max(1e-12, float(np.max(np.abs(step))))), low, high)
         out.append(q.copy())
         errors.append(size)

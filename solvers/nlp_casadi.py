@@ -103,8 +103,8 @@ class Ipopt(CasadiNlp):
             "mu_strategy": "adaptive",
         }
         if warm:
-            own |= {"warm_start_init_point": "yes", "mu_strategy": "monotone", "mu_init": 1e-4,
-                    "warm_start_bound_push": 1e-6, "warm_start_mult_bound_push": 1e-6}  # fmt: skip
+            # The point is known to be near, its multipliers are not: rows may have been added since.
+            own |= {"mu_strategy": "monotone", "mu_init": 1e-3, "bound_push": 1e-4, "bound_frac": 1e-4}
         if self.options.time_limit is not None:
             own["max_wall_time"] = self.options.time_limit
         return {"ipopt": own | self.options.extra}

@@ -158,7 +158,8 @@ def _rounds(
     while number < most:
         number += 1
         program = problem.program(space, problem.eased(points, share), C)
-        found = solver.solve_program(program)
+        near = NlpSolution(program.start, Status.NOT_CONVERGED) if number > 1 else None
+        found = solver.solve_program(program, near)
         iterations += found.iterations
         if np.all(np.isfinite(found.x)):
             C = program.coefficients(found.x)
