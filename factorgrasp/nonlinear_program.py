@@ -120,12 +120,20 @@ def check_program(program: NonlinearProgram, solution: NlpSolution) -> NlpCheck:
     size = max(1.0, *(float(np.abs(part).max(initial=0.0)) for part in (gradient, pushed, z)))
     primal, products = 0.0, 0.0
     loads = max(1.0, float(np.abs(y).max(initial=0.0)), float(np.abs(z).max(initial=0.0)))
-    for value, low, high, load in ((g, program.row_lower, program.row_upper, y), (x, program.lower, program.upper, z)):
+    for value, low, high, load in (
+        (g, program.row_lower, program.row_upper, y),
+        (x, program.lower, program.upper, z),
+    ):
         below, above = low - value, value - high
         primal = max(primal, float(np.maximum(below, above).max(initial=0.0)))
         slack = np.where(load > 0.0, np.abs(above), np.abs(below))
-        products = max(products, float(np.where(load == 0.0, 0.0, np.abs(load) * np.where(np.isfinite(slack), slack, 1.0)).max(initial=0.0)))
+        products = max(
+            products,
+            float(
+                np.where(load == 0.0, 0.0, np.abs(load) * np.where(np.isfinite(slack), slack, 1.0)).max(
+                    initial=0.0
+                )
+            ),
+        )
     dual = float(np.abs(gradient + pushed + z).max(initial=0.0)) / size
     return NlpCheck(program.objective(x), primal, dual, products / loads)
-
-

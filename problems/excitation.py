@@ -183,10 +183,14 @@ class Excitation:
             box = (arm.limits.box_lower, arm.limits.box_upper)
         self.gravity = np.asarray(gravity, dtype=float)
         self.basis = make_basis(settings.basis, settings.duration, settings.bandwidth)
-        self.task = task_space(grasp, self.wrist, human, settings, self.basis, self.gravity, box, start_motion)
+        self.task = task_space(
+            grasp, self.wrist, human, settings, self.basis, self.gravity, box, start_motion
+        )
         self.panel, self._panels = self._panel_length()
         self.nodes, self.node_weights = _gauss(self.panel, self._panels)
-        self.grid = np.linspace(0.0, settings.duration, int(np.ceil(settings.duration / settings.step - 1e-9)) + 1)
+        self.grid = np.linspace(
+            0.0, settings.duration, int(np.ceil(settings.duration / settings.step - 1e-9)) + 1
+        )
         self._grid_values: dict[int, FloatArray] = {}
 
     @cached_property
@@ -215,7 +219,10 @@ class Excitation:
         path: set[tuple[int, float]] = set()
         if space.name == "task":
             count = max(2, int(np.ceil(4.0 * self.settings.duration * self.settings.bandwidth)))
-            times = np.linspace(0.0, self.settings.duration, count + 1)[:-1] + 0.5 * self.settings.duration / count
+            times = (
+                np.linspace(0.0, self.settings.duration, count + 1)[:-1]
+                + 0.5 * self.settings.duration / count
+            )
             path = {(k, float(time)) for k in range(len(space.path_bounds)) for time in times}
         return Points(frozenset(), frozenset(path), windows)
 
@@ -235,7 +242,9 @@ class Excitation:
         for index, time in sorted(points.path):
             one = space.path_bounds[index]
             less = TIGHTER * one.scale
-            path_limits.append(PathLimit(index, time, one.lower + less, one.upper - less, one.scale, one.name))
+            path_limits.append(
+                PathLimit(index, time, one.lower + less, one.upper - less, one.scale, one.name)
+            )
         scale = self.energy_scale
         return TrajectoryProgram(
             space.motion, self.nodes, space.integrand, self.node_weights / (self.settings.duration * scale),
@@ -254,7 +263,9 @@ class Excitation:
                 C[j, max(last - j - 3, 0)] += 0.3
             if self.settings.basis == "bspline":
                 signs = np.cos(np.pi * np.arange(nb))
-                C = np.stack([signs * np.roll(np.sin(np.pi * np.arange(nb) / nb) ** 2, j * nb // 4) for j in range(m)])
+                C = np.stack(
+                    [signs * np.roll(np.sin(np.pi * np.arange(nb) / nb) ** 2, j * nb // 4) for j in range(m)]
+                )
         else:
             C = np.random.default_rng(seed).normal(size=(m, nb))
         C = self._meeting_fixed(space, C, zero=True)
@@ -288,7 +299,9 @@ class Excitation:
         scale = [np.max(np.abs(row)) for row in rows]
         heavy = 1e4
         A = np.vstack([B, *[heavy * row[None] / s for row, s in zip(rows, scale, strict=True)]])
-        b = np.vstack([difference, *[heavy * target[None] / s for target, s in zip(targets, scale, strict=True)]])
+        b = np.vstack(
+            [difference, *[heavy * target[None] / s for target, s in zip(targets, scale, strict=True)]]
+        )
         return np.asarray(np.linalg.lstsq(A, b, rcond=None)[0].T)
 
     # ---- the fine grid --------------------------------------------------------------------------------------------
@@ -312,25 +325,35 @@ class Excitation:
         coordinates, path = set(points.coordinates), set(points.path)
         for index, bound in enumerate(space.coordinate_bounds):
             value = self.on_grid(space, C, bound.order)[bound.coordinate]
-            margin, worst = _margin(t, value, bound.lower, bound.upper, bound.scale, bound.name, bound.unit, False)
+            margin, worst = _margin(
+                t, value, bound.lower, bound.upper, bound.scale, bound.name, bound.unit, False
+            )
             margins.append(margin)
             coordinates |= {(index, float(t[k])) for k in worst}
         if space.path is not None:
             h = space.path.values(z, given)
             for index, one in enumerate(space.path_bounds):
-                margin, worst = _margin(t, h[:, index], one.lower, one.upper, one.scale, one.name, one.unit, one.root)
+                margin, worst = _margin(
+                    t, h[:, index], one.lower, one.upper, one.scale, one.name, one.unit, one.root
+                )
                 margins.append(margin)
                 path |= {(index, float(t[k])) for k in worst}
         starts, shares = self._grid_windows(space, z, given)
         windows, tighter = set(points.windows), points.tighter
         if np.min(shares) < needed:
             worst_start = float(starts[int(np.argmin(shares))])
-            near = {int(np.clip(k, 0, self._panels - self._window_panels)) for k in (np.floor(worst_start / self.panel), np.ceil(worst_start / self.panel))}
+            near = {
+                int(np.clip(k, 0, self._panels - self._window_panels))
+                for k in (np.floor(worst_start / self.panel), np.ceil(worst_start / self.panel))
+            }
             if near <= windows:
                 tighter *= (1.0 + 5e-4) * needed / max(float(np.min(shares)), 0.5 * needed)
             windows |= near
         return PlanCheck(
-            tuple(margins), starts, shares, Points(frozenset(coordinates), frozenset(path), frozenset(windows), tighter)
+            tuple(margins),
+            starts,
+            shares,
+            Points(frozenset(coordinates), frozenset(path), frozenset(windows), tighter),
         )
 
     def excitation_matrix(self, space: PlanSpace, C: FloatArray, start: float, end: float) -> FloatArray:
@@ -341,7 +364,9 @@ class Excitation:
         import casadi as ca
 
         symbol = ca.SX.sym("s", space.integrand.size_out)
-        made = expressions.centred_excitation(symbol, float(self.grid[b] - self.grid[a]), 1.0, self.settings.centred)
+        made = expressions.centred_excitation(
+            symbol, float(self.grid[b] - self.grid[a]), 1.0, self.settings.centred
+        )
         values = NodeFunction("G", symbol, ca.SX.sym("p", 0), made).values(s, np.empty((0, 1)))[0]
         return _full(values[None])[0]
 
@@ -349,14 +374,17 @@ class Excitation:
         """(6, 6) about [turn about the axes of r, lever arm] after the whole motion, what was known before included."""
         z = np.concatenate([self.on_grid(space, C, order) for order in range(3)])
         read = space.read.values(z, space.motion.given(self.grid))
-        return information_of(read, self.grid, self._sensor_noise, self.grasp.information_r)
+        return information_of(read, self.grid, self.sensor_noise, self.grasp.information_r)
 
     # ---- parts ----------------------------------------------------------------------------------------------------
 
     @property
-    def _sensor_noise(self) -> expressions.SensorNoise:
+    def sensor_noise(self) -> expressions.SensorNoise:
+        """Of the residuals of the grasp estimator."""
         gyro, accelerometer = sensor_densities(self.noise, self.grasp.translation)
-        return expressions.SensorNoise(gyro, accelerometer, self.noise.gyro_bias_sd, self.noise.accelerometer_bias_sd)
+        return expressions.SensorNoise(
+            gyro, accelerometer, self.noise.gyro_bias_sd, self.noise.accelerometer_bias_sd
+        )
 
     @property
     def _window_panels(self) -> int:
@@ -367,7 +395,9 @@ class Excitation:
         s = self.settings
         least = PANELS * s.bandwidth
         # At a human's own motion the integrand is as fast as that motion, too.
-        for count in range(int(np.ceil(least * s.window_length)), int(np.ceil(2.0 * least * s.window_length)) + 1):
+        for count in range(
+            int(np.ceil(least * s.window_length)), int(np.ceil(2.0 * least * s.window_length)) + 1
+        ):
             panel = s.window_length / count
             if abs(s.duration / panel - round(s.duration / panel)) < 1e-6:
                 return panel, int(round(s.duration / panel))
@@ -381,7 +411,10 @@ class Excitation:
         for row, first in enumerate(firsts):
             inside = slice(2 * first, 2 * (first + length))
             weights[row, inside] = self.node_weights[inside]
-        words = tuple(f"excitation between {first * self.panel:.2f} s and {(first + length) * self.panel:.2f} s" for first in firsts)
+        words = tuple(
+            f"excitation between {first * self.panel:.2f} s and {(first + length) * self.panel:.2f} s"
+            for first in firsts
+        )
         return Windows(weights, self._condition(points.tighter), self.settings.alpha is not None, words)
 
     def _condition(self, tighter: float) -> NodeFunction:
@@ -395,7 +428,7 @@ class Excitation:
         else:
             s = ca.SX.sym("s", expressions.MOMENTS)
             information = expressions.grasp_information(
-                s, self._sensor_noise, self.settings.duration, self.grasp.information_r
+                s, self.sensor_noise, self.settings.duration, self.grasp.information_r
             )
             made = expressions.variance_ratios(information, self.settings.targets) / tighter
         return NodeFunction("condition", s, ca.SX.sym("p", 0), ca.cse(made))
@@ -404,12 +437,18 @@ class Excitation:
         z = np.concatenate([self.on_grid(space, C, order) for order in range(3)])
         return _cumulative(self.grid, space.integrand.values(z, space.motion.given(self.grid)))
 
-    def _grid_windows(self, space: PlanSpace, z: FloatArray, given: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _grid_windows(
+        self, space: PlanSpace, z: FloatArray, given: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
         total = _cumulative(self.grid, space.integrand.values(z, given))
         length = int(round(self.settings.window_length / (self.grid[1] - self.grid[0])))
         inside = (total[length:] - total[: total.shape[0] - length]).T
         values = self._grid_condition.values(inside, np.empty((0, inside.shape[1])))
-        shares = np.linalg.eigvalsh(_full(values))[:, 0] if self.settings.alpha is not None else np.min(values, axis=1)
+        shares = (
+            np.linalg.eigvalsh(_full(values))[:, 0]
+            if self.settings.alpha is not None
+            else np.min(values, axis=1)
+        )
         return self.grid[: inside.shape[1]], shares
 
     @cached_property
@@ -418,7 +457,9 @@ class Excitation:
 
     def _least_share(self, program: TrajectoryProgram, C: FloatArray) -> float:
         values = program.excitation(program.point(C))
-        return float(np.min(np.linalg.eigvalsh(_full(values))) if self.settings.alpha is not None else np.min(values))
+        return float(
+            np.min(np.linalg.eigvalsh(_full(values))) if self.settings.alpha is not None else np.min(values)
+        )
 
     def _meeting_fixed(self, space: PlanSpace, C: FloatArray, zero: bool = False) -> FloatArray:
         """The nearest coefficients that meet the conditions at the ends (with zero targets when `zero`)."""
@@ -430,7 +471,9 @@ class Excitation:
         return np.asarray(C - (np.linalg.pinv(A / scale) @ ((A @ C.T - b) / scale)).T)
 
 
-def information_of(read: FloatArray, t: FloatArray, noise: expressions.SensorNoise, prior: FloatArray) -> FloatArray:
+def information_of(
+    read: FloatArray, t: FloatArray, noise: expressions.SensorNoise, prior: FloatArray
+) -> FloatArray:
     """Information (6, 6) of a motion whose instants were read (n, 25) by :class:`PlanSpace`."""
     import casadi as ca
 
@@ -471,7 +514,14 @@ def _full(upper: FloatArray) -> FloatArray:
 
 
 def _margin(
-    t: FloatArray, value: FloatArray, lower: float, upper: float, scale: float, name: str, unit: str, root: bool
+    t: FloatArray,
+    value: FloatArray,
+    lower: float,
+    upper: float,
+    scale: float,
+    name: str,
+    unit: str,
+    root: bool,
 ) -> tuple[Margin, list[int]]:
     """The margin of one limit, and the worst instant of every stretch that violates it."""
     left = np.minimum(value - lower, upper - value)
@@ -488,4 +538,3 @@ def _margin(
         worst = [int(a + np.argmin(left[a:b])) for a, b in zip(edges[::2], edges[1::2], strict=True)]
     reach = abs(limit) if root else scale
     return Margin(name, unit, found, limit, margin, float(t[k]), margin / (reach or 1.0)), worst
-

@@ -53,7 +53,9 @@ def with_payload(model: Any, frame: str, mass: float, center: FloatArray) -> Any
 
     out = model.copy()
     tool = out.frames[frame_id(out, frame)]
-    out.appendBodyToJoint(tool.parentJoint, pinocchio.Inertia(mass, np.asarray(center), np.zeros((3, 3))), tool.placement)
+    out.appendBodyToJoint(
+        tool.parentJoint, pinocchio.Inertia(mass, np.asarray(center), np.zeros((3, 3))), tool.placement
+    )
     return out
 
 
@@ -102,13 +104,22 @@ def limits_of(model: Any, stated: Mapping[str, FloatArray | float | None]) -> Ro
         made[name] = array
     limits = RobotLimits(**made)
     if np.any(limits.position_lower >= limits.position_upper):
-        raise InputError("robot.position_lower", "less than position_upper at every joint", f"{limits.position_lower.tolist()}")
-    if limits.box_lower is not None and limits.box_upper is not None and np.any(limits.box_lower >= limits.box_upper):
-        raise InputError("robot.box_lower", "less than box_upper along every axis", f"{limits.box_lower.tolist()}")
-    infinite = replace(limits)
+        raise InputError(
+            "robot.position_lower",
+            "less than position_upper at every joint",
+            f"{limits.position_lower.tolist()}",
+        )
+    if (
+        limits.box_lower is not None
+        and limits.box_upper is not None
+        and np.any(limits.box_lower >= limits.box_upper)
+    ):
+        raise InputError(
+            "robot.box_lower", "less than box_upper along every axis", f"{limits.box_lower.tolist()}"
+        )
     if limits.torque is not None:
-        infinite = replace(limits, torque=np.where(np.isfinite(limits.torque), limits.torque, 1e6))
-    return infinite
+        return replace(limits, torque=np.where(np.isfinite(limits.torque), limits.torque, 1e6))
+    return limits
 
 
 def tool_pose(model: Any, frame: str, q: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -124,7 +135,7 @@ def tool_pose(model: Any, frame: str, q: FloatArray) -> tuple[FloatArray, FloatA
 def follow(
     model: Any, frame: str, limits: RobotLimits, start: FloatArray, rotation: FloatArray, position: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Joint positions (nv, n) along poses ``R_w_r`` (n, 3, 3), ``p_w_r`` (n, 3), each from the one before, and the errors (n,) that are left.
+    """Joint positions (nv, n) along poses ``R_w_r`` (n, 3, 3), ``p_w_r`` (n, 3), each from the one before, and the errors (n,) left.
 
     Damped least squares within the position limits; what a redundant arm leaves open is drawn to the start.
     """
@@ -138,6 +149,7 @@ def follow(
         target = pinocchio.SE3(R, p)
         for number in range(200):
             J = pinocchio.computeFrameJacobian(model, data, q, index, pinocchio.LOCAL)
+            pinocchio.forwardKinematics(model, data, q)
             placement = pinocchio.updateFramePlacement(model, data, index)
             error = pinocchio.log6(placement.actInv(target)).vector
             size = float(np.linalg.norm(error))
@@ -147,7 +159,9 @@ def follow(
             A = J @ J.T + damping * np.eye(6)
             step = J.T @ np.linalg.solve(A, error)
             pull = start - q
-            step += 0.05 * (pull - J.T @ np.linalg.solve(A, J @ pull))
+            if number < 5:
+                # Later it would only keep the pose from being met.
+                step += 0.05 * (pull - J.T @ np.linalg.solve(A, J @ pull))
             q = np.clip(q + step * min(1.0, 0.3 / max(1e-12, float(np.max(np.abs(step))))), low, high)
         out.append(q.copy())
         errors.append(size)
@@ -155,7 +169,13 @@ def follow(
 
 
 def find_configuration(
-    model: Any, frame: str, limits: RobotLimits, rotation: FloatArray, position: FloatArray, seed: FloatArray, tries: int = 20
+    model: Any,
+    frame: str,
+    limits: RobotLimits,
+    rotation: FloatArray,
+    position: FloatArray,
+    seed: FloatArray,
+    tries: int = 20,
 ) -> tuple[FloatArray, float]:
     """A configuration that reaches a pose, from `seed` and from random ones; the best there is, and its error."""
     rng = np.random.default_rng(0)
@@ -173,7 +193,12 @@ def find_configuration(
 
 
 def link_spheres(
-    robot: CasadiRobot, urdf: str | Path, full: Any, start: FloatArray, distance: float, mesh_folders: Sequence[str] = ()
+    robot: CasadiRobot,
+    urdf: str | Path,
+    full: Any,
+    start: FloatArray,
+    distance: float,
+    mesh_folders: Sequence[str] = (),
 ) -> tuple[tuple[tuple[int, FloatArray, float], ...], tuple[tuple[int, int, str], ...]]:
     """Spheres that cover the collision geometry of the URDF, and the pairs of them whose distance is worth watching.
 
@@ -187,7 +212,9 @@ def link_spheres(
     """
     import pinocchio
 
-    geometry = pinocchio.buildGeomFromUrdf(full, str(urdf), pinocchio.GeometryType.COLLISION, package_dirs=list(mesh_folders))
+    geometry = pinocchio.buildGeomFromUrdf(
+        full, str(urdf), pinocchio.GeometryType.COLLISION, package_dirs=list(mesh_folders)
+    )
     spheres: list[tuple[int, FloatArray, float]] = []
     owner: list[tuple[int, str]] = []
     for one in geometry.geometryObjects:
@@ -205,8 +232,12 @@ def link_spheres(
             owner.append((joint, frame if joint >= 0 else "the base"))
         del name
     if not spheres:
-        raise InputError("robot.collision_distance", "a URDF with simple solids as collision geometry", "none (meshes are not read)")
-    pairs = []
+        raise InputError(
+            "robot.collision_distance",
+            "a URDF with simple solids as collision geometry",
+            "none (meshes are not read)",
+        )
+    found = []
     places = _places(robot, spheres, start)
     for i in range(len(spheres)):
         for j in range(i + 1, len(spheres)):
@@ -215,11 +246,14 @@ def link_spheres(
                 continue
             gap = float(np.linalg.norm(places[i] - places[j])) - spheres[i][2] - spheres[j][2]
             if gap > distance:
-                pairs.append((i, j, f"{first} and {second}"))
-    return tuple(spheres), tuple(pairs)
+                found.append((gap, (i, j, f"{first} and {second}")))
+    found.sort(key=lambda one: one[0])
+    return tuple(spheres), tuple(pair for _, pair in found)
 
 
-def _places(robot: CasadiRobot, spheres: Sequence[tuple[int, FloatArray, float]], q: FloatArray) -> FloatArray:
+def _places(
+    robot: CasadiRobot, spheres: Sequence[tuple[int, FloatArray, float]], q: FloatArray
+) -> FloatArray:
     import casadi as ca
 
     motion = robot.motion(ca.DM(q))

@@ -108,7 +108,11 @@ def phi_matrix(rate: Any, change: Any) -> Any:
 
 
 def wrench_energy(
-    instant: Instant, p: Any, covariance: FloatArray, stiffness: tuple[float, float], comfort: tuple[float, float]
+    instant: Instant,
+    p: Any,
+    covariance: FloatArray,
+    stiffness: tuple[float, float],
+    comfort: tuple[float, float],
 ) -> Any:
     """Expected ``|f|^2 / f_0^2 + |m|^2 / m_0^2`` at the wrist through its stiffness (paper (4), with the pose error).
 
@@ -271,7 +275,9 @@ def _upper(M: Any) -> Any:
 
 def _symmetric(v: Any) -> Any:
     ca = _casadi()
-    return ca.vertcat(ca.horzcat(v[0], v[1], v[2]), ca.horzcat(v[1], v[3], v[4]), ca.horzcat(v[2], v[4], v[5]))
+    return ca.vertcat(
+        ca.horzcat(v[0], v[1], v[2]), ca.horzcat(v[1], v[3], v[4]), ca.horzcat(v[2], v[4], v[5])
+    )
 
 
 def _casadi() -> Any:

@@ -91,9 +91,7 @@ def static_human(duration: float, position: FloatArray, rotation: FloatArray) ->
     return HumanMotion("static", duration, place, _still, np.asarray(rotation), _still)
 
 
-def planar_human(
-    duration: float, waypoints: FloatArray, rotation: FloatArray
-) -> HumanMotion:
+def planar_human(duration: float, waypoints: FloatArray, rotation: FloatArray) -> HumanMotion:
     """The wrist travels along straight legs between waypoints (k, 3), each with minimum jerk, and does not turn (paper IV.B).
 
     Raises
@@ -105,7 +103,11 @@ def planar_human(
     legs = np.diff(points, axis=0)
     lengths = np.linalg.norm(legs, axis=1)
     if points.shape[0] < 2 or np.any(lengths < 1e-6):
-        raise InputError("human.waypoints", "at least two positions, each different from the one before", f"{points.tolist()}")
+        raise InputError(
+            "human.waypoints",
+            "at least two positions, each different from the one before",
+            f"{points.tolist()}",
+        )
     # Legs of equal peak acceleration take time as the root of their length.
     share = np.sqrt(lengths) / np.sum(np.sqrt(lengths))
     ends = np.concatenate([[0.0], np.cumsum(share) * duration])
@@ -125,7 +127,9 @@ def planar_human(
         k, _ = leg(t)
         return np.asarray((legs / lengths[:, None])[k].T)
 
-    return HumanMotion("planar", duration, place, _still, np.asarray(rotation), axis, tuple(ends[1:-1].tolist()))
+    return HumanMotion(
+        "planar", duration, place, _still, np.asarray(rotation), axis, tuple(ends[1:-1].tolist())
+    )
 
 
 def task_human(
@@ -167,14 +171,18 @@ def recorded_human(
     """
     t = np.asarray(t, dtype=float) - float(t[0])
     if t[-1] < duration * (1.0 - 1e-9):
-        raise InputError("human.file", f"a recording of at least the duration, {duration:g} s", f"{t[-1]:g} s")
+        raise InputError(
+            "human.file", f"a recording of at least the duration, {duration:g} s", f"{t[-1]:g} s"
+        )
     used = t <= duration
     basis = BSplineBasis(duration, bandwidth)
     B = basis.values(t[used]).T
     first = np.asarray(rotation[0])
     turn = lie.so3_log(first.T @ np.asarray(rotation)[used])
     if np.max(np.linalg.norm(turn, axis=1)) > 3.0:
-        raise InputError("human.file", "a hand that turns by less than half a turn from its first orientation", "more")
+        raise InputError(
+            "human.file", "a hand that turns by less than half a turn from its first orientation", "more"
+        )
     both = np.linalg.lstsq(B, np.hstack([np.asarray(position)[used], turn]), rcond=None)[0]
 
     def place(time: FloatArray) -> FloatArray:
@@ -183,5 +191,3 @@ def recorded_human(
     return HumanMotion(
         "six_dof", duration, place, lambda time: both[:, 3:].T @ basis.values(time), first, _still
     )
-
-

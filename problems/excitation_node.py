@@ -20,7 +20,6 @@ class NodeFunction:
     """
 
     def __init__(self, name: str, z: Any, p: Any, out: Any) -> None:
-        import casadi as ca
 
         self.size_in, self.size_p, self.size_out = int(z.numel()), int(p.numel()), int(out.numel())
         self._name, self._z, self._p, self._out = name, z, p, out

@@ -222,7 +222,10 @@ class TrajectoryProgram:
         times = sorted({one.time for one in self.path_limits})
         self._path_t = np.array(times)
         self._path_B = np.stack([self.motion.basis.values(self._path_t, d) for d in range(3)])
-        self._path_offset, self._path_p = self.motion.offset(self._path_t)[:3], self.motion.given(self._path_t)
+        self._path_offset, self._path_p = (
+            self.motion.offset(self._path_t)[:3],
+            self.motion.given(self._path_t),
+        )
         place = {time: k for k, time in enumerate(times)}
         self._path_k = np.array([place[one.time] for one in self.path_limits], dtype=int)
         self._path_i = np.array([one.index for one in self.path_limits], dtype=int)
@@ -240,7 +243,6 @@ class TrajectoryProgram:
             [self._A_high, np.zeros(window_rows) if matrix else np.full(window_rows, np.inf), path_high]
         )
 
-
     def _patterns(self) -> None:
         nc = self._nc
         rows, columns = [], []
@@ -253,7 +255,11 @@ class TrajectoryProgram:
                 columns += chosen
         self._window_at = (np.array(rows, dtype=int), np.array(columns, dtype=int))
         A = self._A.tocoo()
-        n_a, n_w, n_p = A.shape[0], self._count * (self._rows_per_window if self.windows else 0), len(self.path_limits)
+        n_a, n_w, n_p = (
+            A.shape[0],
+            self._count * (self._rows_per_window if self.windows else 0),
+            len(self.path_limits),
+        )
         path_rows = np.repeat(np.arange(n_p), nc) + n_a + n_w
         path_columns = np.tile(np.arange(nc), n_p)
         rows_all = np.concatenate([A.coords[0], self._window_at[0] + n_a, path_rows]).astype(int)
@@ -331,7 +337,9 @@ class TrajectoryProgram:
         if self.path_limits:
             J = self._path_jacobians(x)[self._path_k, self._path_i].reshape(-1, 3, self._m)
             B = self._path_B[:, :, self._path_k]
-            parts.append((np.einsum("kdj,dbk->kjb", J, B, optimize=True) / self._path_scale[:, None, None]).ravel())
+            parts.append(
+                (np.einsum("kdj,dbk->kjb", J, B, optimize=True) / self._path_scale[:, None, None]).ravel()
+            )
         data = np.bincount(self._J_order, weights=np.concatenate(parts), minlength=self._J.nnz)
         return sp.csc_array((data, self._J.indices, self._J.indptr), self._J.shape)
 
@@ -459,7 +467,9 @@ def _assembled(H: FloatArray, B: FloatArray) -> FloatArray:
     return np.ascontiguousarray(out.transpose(1, 0, 2, 3)).reshape(m * nb, m * nb)
 
 
-def _fixed_pattern(rows: FloatArray, columns: FloatArray, shape: tuple[int, int]) -> tuple[FloatArray, sp.csc_array]:
+def _fixed_pattern(
+    rows: FloatArray, columns: FloatArray, shape: tuple[int, int]
+) -> tuple[FloatArray, sp.csc_array]:
     """Where each of a list of entries goes in the data of a CSC matrix, and that matrix."""
     key = columns * shape[0] + rows
     unique, order = np.unique(key, return_inverse=True)

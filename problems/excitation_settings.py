@@ -36,10 +36,18 @@ class GraspBelief:
             raise InputError("grasp.rotation", "a rotation matrix (3, 3)", f"{R.tolist()}")
         if np.shape(self.translation) != (3,) or not np.all(np.isfinite(self.translation)):
             raise InputError("grasp.translation", "3 finite numbers, m", f"{self.translation}")
-        if P.shape != (6, 6) or not np.all(np.isfinite(P)) or np.max(np.abs(P - P.T)) > 1e-9 * max(1.0, np.abs(P).max()):
+        if (
+            P.shape != (6, 6)
+            or not np.all(np.isfinite(P))
+            or np.max(np.abs(P - P.T)) > 1e-9 * max(1.0, np.abs(P).max())
+        ):
             raise InputError("grasp.covariance", "a symmetric matrix (6, 6)", f"shape {P.shape}")
         if np.min(np.linalg.eigvalsh(P)) < -1e-12 * np.max(np.abs(P)):
-            raise InputError("grasp.covariance", "no negative variance in any direction", f"{np.min(np.linalg.eigvalsh(P)):.2g}")
+            raise InputError(
+                "grasp.covariance",
+                "no negative variance in any direction",
+                f"{np.min(np.linalg.eigvalsh(P)):.2g}",
+            )
 
     @property
     def covariance_r(self) -> FloatArray:
@@ -59,7 +67,12 @@ def _positive(owner: str, item: Any, names: tuple[str, ...]) -> None:
         value = getattr(item, name)
         if value is None:
             continue
-        if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value) or value <= 0.0:
+        if (
+            isinstance(value, bool)
+            or not isinstance(value, int | float)
+            or not np.isfinite(value)
+            or value <= 0.0
+        ):
             raise InputError(f"{owner}.{name}", "a finite number above zero", repr(value))
 
 
@@ -166,15 +179,23 @@ class ExcitationSettings:
                 "none of them" if self.alpha is None else "both",
             )  # fmt: skip
         if self.window is not None and self.window > self.duration * (1.0 + 1e-9):
-            raise InputError("excitation.window", f"at most the duration of {self.duration:g} s", f"{self.window:g} s")
+            raise InputError(
+                "excitation.window", f"at most the duration of {self.duration:g} s", f"{self.window:g} s"
+            )
         if self.alpha is None and self.window is not None and self.window < self.duration:
-            raise InputError("excitation.window", "none with target sd: they hold after the whole duration", f"{self.window:g} s")
+            raise InputError(
+                "excitation.window",
+                "none with target sd: they hold after the whole duration",
+                f"{self.window:g} s",
+            )
         if self.step > 0.25 / self.bandwidth:
-            raise InputError("excitation.step", "at most a quarter of a period of the bandwidth", f"{self.step:g} s")
+            raise InputError(
+                "excitation.step", "at most a quarter of a period of the bandwidth", f"{self.step:g} s"
+            )
 
     @property
     def window_length(self) -> float:
-        """s."""
+        """S."""
         return self.duration if self.window is None else self.window
 
     @property

@@ -173,13 +173,16 @@ def joint_space(
         return out
 
     motion = Motion(basis, n, offset, human.given(grasp.rotation))
-    box = None if limits.box_lower is None or limits.box_upper is None else (limits.box_lower, limits.box_upper)
+    box = (
+        None if limits.box_lower is None or limits.box_upper is None else (limits.box_lower, limits.box_upper)
+    )
     outputs, bounds = _common_path(instant, z, p, grasp, wrist, settings, box)
     names = [str(robot.model.names[j]) for j in range(1, robot.model.njoints)]
     if limits.torque is not None:
         outputs.append(rnea(robot, z[:n], z[n : 2 * n], z[2 * n :]))
         bounds += [
-            PathBound(-size, size, size, f"torque of {name}", "Nm") for name, size in zip(names, limits.torque, strict=True)
+            PathBound(-size, size, size, f"torque of {name}", "Nm")
+            for name, size in zip(names, limits.torque, strict=True)
         ]
     if limits.collision_distance is not None and pairs:
         walked = robot.motion(z[:n])
@@ -206,14 +209,25 @@ def joint_space(
 def _joint_bounds(limits: RobotLimits, names: Sequence[str]) -> list[CoordinateBound]:
     out = []
     for j, name in enumerate(names):
-        out.append(CoordinateBound(j, 0, float(limits.position_lower[j]), float(limits.position_upper[j]), f"position of {name}", "rad"))
+        out.append(
+            CoordinateBound(
+                j,
+                0,
+                float(limits.position_lower[j]),
+                float(limits.position_upper[j]),
+                f"position of {name}",
+                "rad",
+            )
+        )
         for order, word, unit, sizes in (
             (1, "velocity", "rad/s", limits.velocity),
             (2, "acceleration", "rad/s^2", limits.acceleration),
             (3, "jerk", "rad/s^3", limits.jerk),
         ):
             if sizes is not None and np.isfinite(sizes[j]):
-                out.append(CoordinateBound(j, order, -float(sizes[j]), float(sizes[j]), f"{word} of {name}", unit))
+                out.append(
+                    CoordinateBound(j, order, -float(sizes[j]), float(sizes[j]), f"{word} of {name}", unit)
+                )
     return out
 
 
@@ -236,14 +250,26 @@ def _common_path(
     if wrist.max_force is not None:
         away = expressions.force_square(instant, p, grasp.covariance_r[3:, 3:]) * wrist.force_stiffness**2
         at_most(away, wrist.max_force, f"force at the human's wrist (max_force {wrist.max_force:g} N)", "N")
-    at_most(ca.dot(instant.rate, instant.rate), settings.max_angular_velocity, "angular velocity of the end-effector", "rad/s")
+    at_most(
+        ca.dot(instant.rate, instant.rate),
+        settings.max_angular_velocity,
+        "angular velocity of the end-effector",
+        "rad/s",
+    )
     change = instant.rate_change
-    at_most(ca.dot(change, change), settings.max_angular_acceleration, "angular acceleration of the end-effector", "rad/s^2")
+    at_most(
+        ca.dot(change, change),
+        settings.max_angular_acceleration,
+        "angular acceleration of the end-effector",
+        "rad/s^2",
+    )
     if box is not None:
         for k, axis in enumerate("xyz"):
             outputs.append(instant.position[k])
             width = float(box[1][k] - box[0][k])
-            bounds.append(PathBound(float(box[0][k]), float(box[1][k]), 0.5 * width, f"workspace box along {axis}", "m"))
+            bounds.append(
+                PathBound(float(box[0][k]), float(box[1][k]), 0.5 * width, f"workspace box along {axis}", "m")
+            )
     return outputs, bounds
 
 
@@ -254,11 +280,20 @@ def _path(z: Any, p: Any, outputs: Sequence[Any]) -> NodeFunction | None:
 
 
 def _integrand(
-    instant: Any, z: Any, p: Any, grasp: GraspBelief, wrist: HumanWrist, settings: ExcitationSettings, effort: Any = 0.0
+    instant: Any,
+    z: Any,
+    p: Any,
+    grasp: GraspBelief,
+    wrist: HumanWrist,
+    settings: ExcitationSettings,
+    effort: Any = 0.0,
 ) -> NodeFunction:
     import casadi as ca
 
-    stiffness, comfort = (wrist.force_stiffness, wrist.moment_stiffness), (wrist.comfort_force, wrist.comfort_moment)
+    stiffness, comfort = (
+        (wrist.force_stiffness, wrist.moment_stiffness),
+        (wrist.comfort_force, wrist.comfort_moment),
+    )
     energy = expressions.wrench_energy(instant, p, grasp.covariance_r[3:, 3:], stiffness, comfort)
     parts = [energy + effort, *expressions.excitation_moments(instant)]
     if settings.alpha is None:

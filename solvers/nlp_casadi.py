@@ -9,6 +9,7 @@ import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from importlib import import_module
 from typing import Any, ClassVar
 
 import numpy as np
@@ -32,11 +33,17 @@ _WORDS = {
 }
 
 
+_FLOOR = 1e-6
+
+
 class CasadiNlp(NlpSolver):
     """A plugin of ``casadi.nlpsol``."""
 
     plugin: ClassVar[str]
     modules: ClassVar[tuple[str, ...]] = ("casadi",)
+    pip: ClassVar[str] = "casadi"
+    convex: ClassVar[bool] = False
+    """Whether the Hessian has to be positive definite: its eigenvalues are then raised to a floor."""
 
     def plugin_options(self, warm: bool) -> dict[str, Any]:
         """What the plugin is told, from our options."""
@@ -46,8 +53,8 @@ class CasadiNlp(NlpSolver):
         import casadi
 
         began = time.perf_counter()
-        oracle = _oracle(program)
-        options = {"print_time": False, "error_on_fail": False, **self.plugin_options(warm_start is not None)}
+        oracle = _Oracle(program, self.convex)
+        options = {"print_time": False, "error_on_fail": False, "show_eval_warnings": False, **self.plugin_options(warm_start is not None)}
         with _silence():
             solver = casadi.nlpsol("nlp", self.plugin, oracle.function, options)
         inputs: dict[str, Any] = {
@@ -102,8 +109,8 @@ class Ipopt(CasadiNlp):
             "mu_strategy": "adaptive",
         }
         if warm:
-            own |= {"warm_start_init_point": "yes", "mu_strategy": "monotone", "mu_init": 1e-4,
-                    "warm_start_bound_push": 1e-6, "warm_start_mult_bound_push": 1e-6}  # fmt: skip
+            # The point is known to be near, its multipliers are not: rows may have been added since.
+            own |= {"mu_strategy": "monotone", "mu_init": 1e-3, "bound_push": 1e-4, "bound_frac": 1e-4}
         if self.options.time_limit is not None:
             own["max_wall_time"] = self.options.time_limit
         return {"ipopt": own | self.options.extra}
@@ -125,24 +132,22 @@ class Fatrop(CasadiNlp):
 
 
 class SqpMethod(CasadiNlp):
-    """CasADi's SQP with exact, convexified Hessians over the active-set solver qrqp."""
+    """CasADi's SQP with exact Hessians, made convex, over the active-set solver qpOASES.
+
+    Of the QP solvers that come with CasADi, qpOASES and daqp solve the excitation programs; qrqp, osqp, highs, ipqp and proxqp do not.
+    """
 
     name: ClassVar[str] = "sqpmethod"
     plugin: ClassVar[str] = "sqpmethod"
+    convex: ClassVar[bool] = True
 
     def plugin_options(self, warm: bool) -> dict[str, Any]:
         own: dict[str, Any] = {
-            "qpsol": "qrqp",
-            "qpsol_options": {
-                "print_iter": False,
-                "print_header": False,
-                "print_info": False,
-                "error_on_fail": False,
-            },
+            "qpsol": "qpoases",
+            "qpsol_options": {"printLevel": "none", "error_on_fail": False},
             "print_iteration": False,
             "print_header": False,
             "print_status": False,
-            "convexify_strategy": "regularize",
             "max_iter": self.options.max_iterations or 200,
             "tol_pr": self.options.tolerance,
             "tol_du": self.options.tolerance,
@@ -153,10 +158,10 @@ class SqpMethod(CasadiNlp):
 class _Oracle:
     """The function that CasADi sees, and every derivative of it that a solver asked for."""
 
-    def __init__(self, program: NonlinearProgram) -> None:
+    def __init__(self, program: NonlinearProgram, convex: bool) -> None:
         import casadi
 
-        self.program = program
+        self.program, self.convex = program, convex
         self.failure: Exception | None = None
         self.kept: list[Any] = []  # CasADi does not hold its callbacks
         n, m = program.start.size, program.row_lower.size
@@ -193,7 +198,8 @@ class _Oracle:
         factor = float(given["lam:f"][0]) if given["lam:f"].size else 0.0
         if key == "grad:gamma:x":
             return casadi.DM(factor * program.gradient(x) + program.jacobian(x).T @ given["lam:g"])
-        data = program.hessian(x, factor, given["lam:g"]).data
+        found = program.hessian(x, factor, given["lam:g"])
+        data = _raised(found) if self.convex else found.data
         if key.startswith("triu"):
             return casadi.DM(self._triangle, data[self._upper])
         return casadi.DM(self._hessian, data)
@@ -204,8 +210,12 @@ class _Oracle:
         return made
 
 
-def _oracle(program: NonlinearProgram) -> _Oracle:
-    return _Oracle(program)
+def _raised(hessian: sp.csc_array) -> FloatArray:
+    """Entries of the nearest matrix whose eigenvalues are at least the floor; a block-diagonal pattern stays what it is."""
+    values, vectors = np.linalg.eigh(hessian.toarray())
+    raised = (vectors * np.maximum(values, _FLOOR * max(1.0, float(np.max(np.abs(values)))))) @ vectors.T
+    columns = np.repeat(np.arange(hessian.shape[1]), np.diff(hessian.indptr))
+    return np.asarray(raised[hessian.indices, columns])
 
 
 def _callback_class() -> Callable[..., Any]:
@@ -214,10 +224,10 @@ def _callback_class() -> Callable[..., Any]:
     if _CALLBACK is None:
         import casadi
 
-        class Callback(casadi.Callback):  # type: ignore[misc]
+        class Callback(casadi.Callback):
             def __init__(self, oracle: _Oracle, name: str, ins: list[str], outs: list[str]) -> None:
                 casadi.Callback.__init__(self)
-                self.oracle, self.ins, self.outs = oracle, ins, outs
+                self.owner, self.ins, self.outs = oracle, ins, outs
                 self.construct(name, {})
 
             def get_n_in(self) -> int:
@@ -233,22 +243,22 @@ def _callback_class() -> Callable[..., Any]:
                 return self.outs[k].replace(":", "_")
 
             def get_sparsity_in(self, k: int) -> Any:
-                return self.oracle.sparsities[self.ins[k]]
+                return self.owner.sparsities[self.ins[k]]
 
             def get_sparsity_out(self, k: int) -> Any:
-                return self.oracle.sparsities[self.outs[k]]
+                return self.owner.sparsities[self.outs[k]]
 
             def eval(self, arguments: Sequence[Any]) -> list[Any]:
                 given = {key: value.full().ravel() for key, value in zip(self.ins, arguments, strict=True)}
                 try:
-                    return [self.oracle.value(key, given) for key in self.outs]
+                    return [self.owner.value(key, given) for key in self.outs]
                 except Exception as error:
                     # CasADi would print it and go on; the caller raises it again.
-                    self.oracle.failure = error
+                    self.owner.failure = error
                     raise
 
             def get_factory(self, name: str, ins: Sequence[str], outs: Sequence[str], aux: Any, options: Any) -> Any:  # fmt: skip
-                return self.oracle.make(name, ins, outs)
+                return self.owner.make(name, ins, outs)
 
         _CALLBACK = Callback
     return _CALLBACK
@@ -262,8 +272,7 @@ def _ones(matrix: sp.csc_array) -> sp.csc_array:
 
 
 def _pattern(matrix: sp.csc_array) -> Any:
-    import casadi
-
+    casadi: Any = import_module("casadi")
     return casadi.Sparsity(*matrix.shape, matrix.indptr.tolist(), matrix.indices.tolist())
 
 

@@ -1,8 +1,8 @@
 """Constraint exchange: limits are imposed where a fine grid shows that they matter, until they hold everywhere on it.
 
-A limit that has to hold at every instant is infinitely many rows. Imposing it at a few nodes lets the motion exceed it between them; imposing
-it at a thousand a second makes the program slow. So the program is solved with few rows, the answer is checked on the grid, the worst instant
-of every stretch that violates a limit becomes a row, and the program is solved again from there.
+A limit that has to hold at every instant is infinitely many rows. Imposing it at a few nodes lets the motion exceed it between them;
+imposing it at a thousand a second makes the program slow. So the program is solved with few rows, the answer is checked on the grid, the
+worst instant of every stretch that violates a limit becomes a row, and the program is solved again from there.
 """
 
 from __future__ import annotations
@@ -114,7 +114,12 @@ def solve_by_exchange(
 
 
 def _most(
-    problem: ExchangeProblem, space: Any, solver: NlpSolver, start: FloatArray, failed: ExchangeResult, began: float
+    problem: ExchangeProblem,
+    space: Any,
+    solver: NlpSolver,
+    start: FloatArray,
+    failed: ExchangeResult,
+    began: float,
 ) -> ExchangeResult:
     """The largest share of the demand that can be met, by bisection from below; the whole demand if it can be met from there."""
     C, share = _within_limits(problem, space, start, failed.points)
@@ -139,13 +144,22 @@ def _most(
 
 
 def _rounds(
-    problem: ExchangeProblem, space: Any, solver: NlpSolver, start: FloatArray, points: Any, began: float, share: float,
+    problem: ExchangeProblem,
+    space: Any,
+    solver: NlpSolver,
+    start: FloatArray,
+    points: Any,
+    began: float,
+    share: float,
     most: int = MOST_ROUNDS,
 ) -> ExchangeResult:
     C, iterations = start, 0
-    for number in range(1, most + 1):
+    number = 0
+    while number < most:
+        number += 1
         program = problem.program(space, problem.eased(points, share), C)
-        found = solver.solve_program(program)
+        near = NlpSolution(program.start, Status.NOT_CONVERGED) if number > 1 else None
+        found = solver.solve_program(program, near)
         iterations += found.iterations
         if np.all(np.isfinite(found.x)):
             C = program.coefficients(found.x)
@@ -156,14 +170,19 @@ def _rounds(
             break
     status, message = found.status, found.message
     if found.status.ok and not settled:
-        status, message = Status.NOT_CONVERGED, f"limits still violated between the instants imposed after {number} rounds"
+        status, message = (
+            Status.NOT_CONVERGED,
+            f"limits still violated between the instants imposed after {number} rounds",
+        )
     return ExchangeResult(
         C, status, message, check, points, program, found, share, _binding(program, found), number, iterations,
         time.perf_counter() - began,
     )  # fmt: skip
 
 
-def _within_limits(problem: ExchangeProblem, space: Any, C: FloatArray, points: Any) -> tuple[FloatArray, float]:
+def _within_limits(
+    problem: ExchangeProblem, space: Any, C: FloatArray, points: Any
+) -> tuple[FloatArray, float]:
     """The same motion made so small that no limit is violated, and the share of the demand that it meets."""
     for _ in range(40):
         check = problem.check(space, C, points)
@@ -178,10 +197,14 @@ def _binding(program: NonlinearProgram, found: NlpSolution) -> tuple[str, ...]:
     loads = np.abs(found.multipliers)
     if not loads.size or not np.any(np.isfinite(loads)):
         return ()
-    rows = [k for k in np.argsort(-loads) if np.isfinite(loads[k]) and program.row_lower[k] < program.row_upper[k]]
+    rows = [
+        k for k in np.argsort(-loads) if np.isfinite(loads[k]) and program.row_lower[k] < program.row_upper[k]
+    ]
     total: dict[str, float] = {}
     for k in rows:
         total[program.row_words(int(k))] = total.get(program.row_words(int(k)), 0.0) + float(loads[k])
     heaviest = max(total.values(), default=0.0)
     floor = max(LOADED, 1e-3 * heaviest)
-    return tuple(sorted((word for word, load in total.items() if load > floor), key=lambda word: -total[word]))
+    return tuple(
+        sorted((word for word, load in total.items() if load > floor), key=lambda word: -total[word])
+    )

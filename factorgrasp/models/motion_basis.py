@@ -50,7 +50,9 @@ class FourierBasis:
         self.harmonics = int(np.floor(duration * bandwidth * (1.0 + 1e-9)))
         if self.harmonics < 1:
             raise InputError(
-                "excitation.bandwidth", f"at least 1 / duration = {1.0 / duration:.3g} Hz", f"{bandwidth:g} Hz"
+                "excitation.bandwidth",
+                f"at least 1 / duration = {1.0 / duration:.3g} Hz",
+                f"{bandwidth:g} Hz",
             )
         self.size = 2 * self.harmonics + 1
 
@@ -85,7 +87,9 @@ class BSplineBasis:
         intervals = int(np.ceil(2.0 * duration * bandwidth * (1.0 - 1e-9)))
         if intervals < 2:
             raise InputError(
-                "excitation.bandwidth", f"at least 1 / duration = {1.0 / duration:.3g} Hz", f"{bandwidth:g} Hz"
+                "excitation.bandwidth",
+                f"at least 1 / duration = {1.0 / duration:.3g} Hz",
+                f"{bandwidth:g} Hz",
             )
         inner = np.linspace(0.0, duration, intervals + 1)
         self._knots = np.concatenate([np.zeros(self.degree), inner, np.full(self.degree, duration)])
