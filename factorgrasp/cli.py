@@ -114,10 +114,25 @@ def solve_command(
             metavar="DIR", help="Where results go. \\[default: results/<name of FILE>]", show_default=False
         ),
     ] = None,
+    export: Annotated[
+        str | None,
+        typer.Option(
+            metavar="csv,parquet",
+            help="Also write the table over time (human dynamics) as estimate.csv, estimate.parquet.",
+            show_default=False,
+        ),
+    ] = None,
 ) -> None:
     """Solve a problem file: prints the answer and writes estimate.json, estimate.npz and report.html."""
     with _exit_codes():
-        _finish(_solve(file, solver, out or Path("results") / file.stem))
+        from factorgrasp.results import export_forms, export_tables
+
+        forms = () if export is None else export_forms(export)
+        place = out or Path("results") / file.stem
+        estimate = _solve(file, solver, place)
+        for path in export_tables(estimate, place, forms) if forms else ():
+            _out.print(f"wrote {path}")
+        _finish(estimate)
 
 
 @app.command("demo")

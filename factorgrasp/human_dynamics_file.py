@@ -13,14 +13,10 @@ from typing import Any, Literal
 import numpy as np
 
 from factorgrasp.errors import InputError
-from factorgrasp.human_dynamics_inputs import (
-    PLATE_COVARIANCE,
-    Six,
-    mounting,
-    read_sensors,
-    read_wrenches,
-)
+from factorgrasp.human_dynamics_forces import PLATE_COVARIANCE, Six, mounting, read_wrenches
+from factorgrasp.human_dynamics_inputs import read_sensors
 from factorgrasp.human_dynamics_motion import BodyMotion, Vector, read_body_motion
+from factorgrasp.human_dynamics_spelling import canonical
 from factorgrasp.human_dynamics_task import HumanDynamicsTask
 from factorgrasp.problems.human_dynamics_constraints import DynamicsConstraint, TorqueLimit, feet_on_the_floor
 from factorgrasp.problems.human_dynamics_settings import HumanDynamicsNoise, PerName
@@ -49,6 +45,7 @@ def build(table: Mapping[str, Any], base_dir: Path) -> HumanDynamicsTask:
     InputError
         Naming the table and the key, or the recording and the column.
     """
+    table = canonical(table)
     check_keys(table, TABLES, "")
     contacts, constraints = sub_table(table, "contacts"), sub_table(table, "constraints")
     check_keys(contacts, ("unmeasured", "payload", "points", "method"), "[contacts]")
@@ -63,8 +60,9 @@ def build(table: Mapping[str, Any], base_dir: Path) -> HumanDynamicsTask:
 
     body = read_body_motion(table, base_dir)
     noise = _noise(covariance, body)
-    wrenches = read_wrenches(table, body, base_dir, plate)
-    sensors = [*wrenches, *read_sensors(table, body, base_dir)]
+    wrenches = read_wrenches(table.get("forces"), body, base_dir, plate)
+    bandwidth = get(sub_table(table, "motion"), "bandwidth", float, "[motion]", 6.0)
+    sensors = [*wrenches, *read_sensors(table.get("sensors", []), body, base_dir, bandwidth)]
     unmeasured = _links(contacts, "unmeasured", body)
     payload = _links(contacts, "payload", body)
     for link in payload:
@@ -93,6 +91,7 @@ def build(table: Mapping[str, Any], base_dir: Path) -> HumanDynamicsTask:
         method=method,
         constraints=_constraints(constraints, body),
         hard_dynamics=get(constraints, "hard_dynamics", bool, "[constraints]", False),
+        extras=body.extras,
     )
 
 

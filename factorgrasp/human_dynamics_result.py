@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,8 @@ class HumanDynamicsResult:
         At the good frames.
     weighing : Weighing or None
         None where no force was measured, or an unmeasured contact carries some of the weight.
+    extras : dict of str to ndarray
+        Over all frames: the configurations, where they were estimated.
     """
 
     estimate: Estimate
@@ -51,6 +54,7 @@ class HumanDynamicsResult:
     jointed: tuple[str, ...] = ()
     payload: Payload | None = None
     weighing: Weighing | None = None
+    extras: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def status(self) -> Status:
@@ -81,7 +85,7 @@ class HumanDynamicsResult:
         for key in ("mass", "mass_sd"):
             values = np.full(len(frames), np.nan) if self.payload is None else getattr(self.payload, key)
             out[f"payload_{key}"] = self._all(values)
-        return out
+        return {**out, **self.extras}
 
     def to_dict(self) -> JsonDict:
         """The summary that ``estimate.json`` holds."""

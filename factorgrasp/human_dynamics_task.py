@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -55,6 +55,8 @@ class HumanDynamicsTask:
         with them.
     constraints : sequence of DynamicsConstraint
     hard_dynamics : bool
+    extras : mapping of str to ndarray
+        Over all frames of the clock, to be written beside the result.
     """
 
     kind = "human_dynamics"
@@ -73,6 +75,7 @@ class HumanDynamicsTask:
         method: Literal["joint", "two_tasks"] = "joint",
         constraints: Sequence[DynamicsConstraint] = (),
         hard_dynamics: bool = False,
+        extras: Mapping[str, Any] | None = None,
     ) -> None:
         self.noise, self.contacts, self.payload = (
             noise or HumanDynamicsNoise(),
@@ -113,7 +116,7 @@ class HumanDynamicsTask:
             assert self.momentum is not None
             every = [sensor for sensor in sensors if not isinstance(sensor, ExternalWrench)]
             every.append(self.momentum.as_sensor())
-        self.method, self._points = method, where
+        self.method, self._points, self.extras = method, where, dict(extras or {})
         self.problem = HumanDynamics(motion, every, self.noise, (), constraints, hard_dynamics)
         self._weighing = None if self.contacts else weigh(motion, wrenches)
 
@@ -137,7 +140,15 @@ class HumanDynamicsTask:
         motion = self.problem.motion
         jointed = tuple(joint.name for joint in motion.joints if joint.dofs)
         return HumanDynamicsResult(
-            self._summary(frames), frames, self.clock, self.good, motion.R, jointed, payload, self._weighing
+            self._summary(frames),
+            frames,
+            self.clock,
+            self.good,
+            motion.R,
+            jointed,
+            payload,
+            self._weighing,
+            self.extras,
         )
 
     # ---- the middle frame, for the comparison of solvers ------------------------------------------------------

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from factorgrasp.atomic import replacing, write_text
+from factorgrasp.errors import InputError
 from factorgrasp.typing import FloatArray, JsonDict
 
 if TYPE_CHECKING:
@@ -35,6 +36,36 @@ def write_result(directory: Path, record: JsonDict, arrays: Mapping[str, FloatAr
     # The JSON comes last: whoever finds it finds the arrays.
     text = json.dumps(finite(record), indent=2, allow_nan=False, ensure_ascii=False)
     return write_text(directory / JSON_NAME, text + "\n")
+
+
+def export_forms(text: str) -> tuple[str, ...]:
+    """Forms of a table over time from ``"csv,parquet"``.
+
+    Raises
+    ------
+    InputError
+        For a form that is none.
+    """
+    forms = tuple(word.strip().lower().removeprefix(".") for word in text.split(",") if word.strip())
+    unknown = [form for form in forms if form not in ("csv", "parquet")]
+    if unknown or not forms:
+        raise InputError("--export", "csv or parquet, or both with a comma between them", repr(text))
+    return forms
+
+
+def export_tables(estimate: Any, directory: Path, forms: Sequence[str]) -> list[Path]:
+    """Write the table over time of an estimate as ``estimate.csv`` or ``estimate.parquet``, each atomically; returns the paths.
+
+    Raises
+    ------
+    InputError
+        When the kind of problem has no table over time.
+    """
+    if not hasattr(estimate, "export"):
+        raise InputError(
+            "--export", "a problem with a table over time, such as human_dynamics", "another one"
+        )
+    return [estimate.export(directory / f"{Path(NPZ_NAME).stem}.{form}") for form in forms]
 
 
 def write_comparison(comparison: Comparison, directory: Path) -> list[Path]:

@@ -106,14 +106,8 @@ def _spread(
             turned[:, link] -= wrenches[:, link]
     by_q = -np.einsum("nlij,nljk->nik", maps, wrench_turn(turned) @ J + tree.spatial_inertia @ dalpha)
     by_a = -np.einsum("nlij,nljk->nik", maps @ tree.spatial_inertia, J)
-    first, cross, left = (
-        np.sqrt(noise.position_gain),
-        noise.ratio * np.sqrt(noise.position_gain),
-        np.sqrt(max(noise.left_gain, 0.0)),
-    )
-    innovation = np.concatenate(
-        [_times(first * by_q + cross * by_a, noise), _times(left * by_a, noise)], axis=2
-    )
+    first, cross, left = np.sqrt(noise.position_gain), noise.ratio * np.sqrt(noise.position_gain), noise.left
+    innovation = np.concatenate([_times(first * by_q + cross * by_a, noise), _times(by_a, left)], axis=2)
     wrench = np.zeros((k.count, len(measured), 6, noise.size))
     for i, (link, world) in enumerate(zip(measured, in_world, strict=True)):
         if world:
@@ -121,7 +115,7 @@ def _spread(
     acceleration = np.zeros((k.count, len(contacts), 6, 2 * noise.size))
     for i, link in enumerate(contacts):
         acceleration[:, i, :, : noise.size] = _times(first * dalpha[:, link] + cross * J[:, link], noise)
-        acceleration[:, i, :, noise.size :] = _times(left * J[:, link], noise)
+        acceleration[:, i, :, noise.size :] = _times(J[:, link], left)
     return innovation, wrench, acceleration
 
 

@@ -81,7 +81,7 @@ class HumanDynamics:
         every, errors = self.sensors, motion.state_noise
         if errors is not None:
             every += state_sensors(tree, errors, motion.kinematics(), self.sensors, use_motion)
-            use_motion = use_motion and errors.acceleration_gain == 0.0
+            use_motion = use_motion and not errors.gives_accelerations
         self.system = HumanDynamicsSystem(
             tree, every, noise, contacts, use_motion, hard_dynamics, rows, errors is not None
         )

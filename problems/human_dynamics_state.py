@@ -81,7 +81,7 @@ def state_sensors(
 ) -> tuple[Sensor, ...]:
     """The rows that the noise of the configuration adds at the frames of `k`; accelerations only where no sensor gives them."""
     prior = StateError(np.zeros((k.count, noise.size)), noise.position_gain * noise.covariance)
-    if not use_motion or noise.acceleration_gain == 0.0:
+    if not use_motion or not noise.gives_accelerations:
         return (prior,)
     have = {(sensor.kind, sensor.where) for sensor in sensors}
     root = not tree.fixed_base and ("link acceleration", tree.links[tree.root]) not in have
@@ -90,7 +90,7 @@ def state_sensors(
     if not index:
         return (prior,)
     own = MotionAcceleration(
-        np.zeros((k.count, sum(map(len, index)))), noise.left_gain * noise.part(np.concatenate(index)),
+        np.zeros((k.count, sum(map(len, index)))), noise.left.part(np.concatenate(index)),
         root=root, joints=tuple(tree.joints[j] for j in chosen), ratio=noise.ratio,
     )  # fmt: skip
     return prior, replace(own, values=own.read(tree, k))

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import zipfile
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,6 +17,56 @@ NEEDED = (
     "t", "bodies", "mass", "com", "inertia", "R", "p", "w", "al", "vcom", "acom", "joints", "jparent", "jchild", "jpos",
 )  # fmt: skip
 GROUND = "ground"
+
+
+def is_link_archive(path: str | Path) -> bool:
+    """Whether a file is an archive of link-level arrays (and not a table of columns)."""
+    file = Path(path)
+    if file.suffix.lower() != ".npz" or not file.is_file():
+        return False
+    try:
+        with np.load(file, allow_pickle=False) as archive:
+            return "bodies" in archive and "R" in archive
+    except (OSError, ValueError, zipfile.BadZipFile):
+        return False
+
+
+def with_masses_of(motion: LinkMotion, path: str | Path) -> LinkMotion:
+    """A motion with the masses, centres of mass and inertias of another archive; its bodies are matched by name."""
+    data = _read(path, ("bodies", "mass", "com", "inertia"))
+    names = [str(name) for name in data["bodies"]]
+    missing = [link for link in motion.links if link not in names]
+    if missing:
+        raise InputError(f"{Path(path).name}: bodies", "those of the motion", ", ".join(missing) + " missing")
+    at = [names.index(link) for link in motion.links]
+    return replace(motion, mass=data["mass"][at], com=data["com"][at], inertia=data["inertia"][at])
+
+
+def link_poses(path: str | Path) -> tuple[FloatArray, tuple[str, ...], FloatArray, FloatArray]:
+    """Times (n,), bodies, orientations (n, L, 3, 3) and origins (n, L, 3) alone."""
+    data = _read(path, ("t", "bodies", "R", "p"))
+    bodies = tuple(str(name) for name in data["bodies"])
+    R, p = np.asarray(data["R"], dtype=float), np.asarray(data["p"], dtype=float)
+    shape = (data["t"].size, len(bodies), 3)
+    if p.shape != shape or R.shape != (*shape, 3):
+        raise InputError(
+            f"{Path(path).name}: R, p", f"shapes {(*shape, 3)} and {shape}", f"{R.shape} and {p.shape}"
+        )
+    return np.asarray(data["t"], dtype=float), bodies, R, p
+
+
+def _read(path: str | Path, needed: tuple[str, ...]) -> dict[str, Any]:
+    file = Path(path)
+    try:
+        with np.load(file, allow_pickle=False) as archive:
+            missing = [name for name in needed if name not in archive]
+            if missing:
+                raise InputError(file.name, "the fields " + ", ".join(needed), "no " + ", ".join(missing))
+            return {name: archive[name] for name in needed}
+    except InputError:
+        raise
+    except (OSError, ValueError, zipfile.BadZipFile) as error:
+        raise InputError(str(file), "an archive of link-level arrays (.npz)", str(error)) from error
 
 
 def load_coordinates(path: str | Path) -> dict[str, tuple[FloatArray, FloatArray]]:
@@ -62,19 +115,24 @@ def load_links(
     InputError
         Naming the field that is missing or has the wrong shape.
     """
-    with np.load(path, allow_pickle=False) as archive:
-        missing = [name for name in NEEDED if name not in archive]
-        if missing:
-            raise InputError(
-                str(Path(path).name), "the fields " + ", ".join(NEEDED), "no " + ", ".join(missing)
-            )
-        data = {name: archive[name] for name in NEEDED}
+    data = _read(path, NEEDED)
     links = [str(name) for name in data["bodies"]]
-    real: dict[str, FloatArray] = {
-        name: np.asarray(data[name], dtype=float)
-        for name in NEEDED
-        if name not in ("bodies", "joints", "jparent", "jchild")
-    }
+    names = ("bodies", "joints", "jparent", "jchild")
+    real: dict[str, FloatArray] = {}
+    count, bodies, joints_in = data["t"].shape[:1], (len(links),), data["joints"].shape[:1]
+    shapes: dict[str, tuple[int, ...]] = {
+        "t": count, "mass": bodies, "com": (*bodies, 3), "inertia": (*bodies, 3, 3), "R": (*count, *bodies, 3, 3),
+        **{name: (*count, *bodies, 3) for name in ("p", "w", "al", "vcom", "acom")}, "jpos": (*count, *joints_in, 3),
+        "jparent": joints_in, "jchild": joints_in,
+    }  # fmt: skip
+    for name in NEEDED:
+        if name in shapes and data[name].shape != shapes[name]:
+            raise InputError(f"{Path(path).name}: {name}", f"shape {shapes[name]}", str(data[name].shape))
+        if name not in names:
+            try:
+                real[name] = np.asarray(data[name], dtype=float)
+            except ValueError as error:
+                raise InputError(f"{Path(path).name}: {name}", "numbers", str(error)) from error
     kept = [j for j, parent in enumerate(data["jparent"]) if str(parent) != GROUND]
     joints = []
     for j in kept:

@@ -145,6 +145,11 @@ class PinocchioTree:
         )  # fmt: skip
 
     @property
+    def columns(self) -> tuple[IntArray, ...]:
+        """Of every joint: the components of pinocchio's velocities that belong to it."""
+        return tuple(self._columns)
+
+    @property
     def tangent_columns(self) -> IntArray:
         """(k,) where the components of a :class:`~factorgrasp.problems.link_motion.StateNoise` stand in pinocchio's tangent vector."""
         return np.concatenate([np.arange(6 if self.floating else 0), self._all_columns]).astype(np.intp)

@@ -18,6 +18,7 @@ from factorgrasp.errors import InputError
 from factorgrasp.models import anthropometry as tables
 from factorgrasp.models.anthropometry import Sex
 from factorgrasp.models.solids import Column, Solid, box, gyration, join, remove, rod
+from factorgrasp.models.urdf_check import check_urdf
 from factorgrasp.typing import FloatArray
 
 JointKind = Literal["revolute", "spherical"]
@@ -97,6 +98,28 @@ class HumanBody:
             for name, (back, front, z) in spans.items():
                 corners = [(x, y, z) for x in (back, front) for y in (-breadth, breadth)]
                 out[f"{side}{name}"] = np.array(corners, dtype=np.float64)
+        return out
+
+    @property
+    def markers(self) -> Mapping[str, tuple[str, FloatArray]]:
+        """Name to (link, position in its frame, m): four points on the skin of every segment.
+
+        A marker set for simulations and for suits whose markers follow it; names are the segment's with ``_1`` to ``_4`` behind.
+        """
+        out: dict[str, tuple[str, FloatArray]] = {}
+        for link, solid in self.segments.items():
+            end = self.ends[link]
+            length = float(np.linalg.norm(end))
+            along = end / length
+            # Half of the thickness of a bar of that mass and length with the density of water.
+            radius = max(0.5 * float(np.sqrt(solid.mass / (1000.0 * length))), 0.02)
+            side = np.cross(along, [1.0, 0.0, 0.0] if abs(along[0]) < 0.9 else [0.0, 1.0, 0.0])
+            side /= np.linalg.norm(side)
+            front = np.cross(side, along)
+            for k, (share, x, y) in enumerate(
+                ((0.15, 1.0, 0.0), (0.4, -0.6, 0.8), (0.65, -0.6, -0.8), (0.9, 0.8, 0.6)), start=1
+            ):
+                out[f"{link}_{k}"] = (link, share * end + radius * (x * side + y * front))
         return out
 
     @property
@@ -246,6 +269,7 @@ def load_body(urdf: str | Path, floating: bool = True) -> Any:
     path = Path(urdf)
     if not path.is_file():
         raise InputError("urdf", "an existing URDF file", str(path))
+    check_urdf(path)
     try:
         return (
             pin.buildModelFromUrdf(str(path), pin.JointModelFreeFlyer())

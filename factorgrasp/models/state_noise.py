@@ -30,12 +30,16 @@ class StateNoise:
     position_gain, acceleration_gain, cross_gain : float
         ``g_q``, ``g_a`` (1/s^4) and ``g_qa`` (1/s^2); 1, 0 and 0 where accelerations do not come from these samples, and then
         ``HumanDynamicsNoise`` says how noisy they are.
+    acceleration : ndarray or None
+        Covariance of the accelerations, (k, k) or (n, k, k), in the order of `covariance`, where a smoother gives it; errors of
+        configurations are then taken to tell nothing of them. `acceleration_gain` must be 0.
     """
 
     covariance: FloatArray
     position_gain: float = 1.0
     acceleration_gain: float = 0.0
     cross_gain: float = 0.0
+    acceleration: FloatArray | None = None
 
     def __post_init__(self) -> None:
         C = np.asarray(self.covariance, dtype=float)
@@ -51,6 +55,20 @@ class StateNoise:
                 "gains of the state's noise", "position gain above zero, acceleration gain of at least zero",
                 f"{self.position_gain}, {self.acceleration_gain}",
             )  # fmt: skip
+        if self.acceleration is not None:
+            A = np.asarray(self.acceleration, dtype=float)
+            object.__setattr__(self, "acceleration", A)
+            if (
+                A.shape[-2:] != (self.size, self.size)
+                or A.ndim > 3
+                or not np.all(np.isfinite(A))
+                or self.acceleration_gain
+            ):
+                raise InputError(
+                    "covariance of the accelerations",
+                    f"finite, of shape ({self.size}, {self.size}) or (n, {self.size}, {self.size}), without a gain",
+                    f"shape {A.shape}",
+                )
         if self.acceleration_gain and self.left_gain <= 0.0:
             raise InputError(
                 "cross gain of the state's noise", "cross^2 < position * acceleration",
@@ -84,13 +102,28 @@ class StateNoise:
         """Gain of an acceleration whose configuration is known: ``g_a - g_qa^2 / g_q``."""
         return self.acceleration_gain - self.cross_gain**2 / self.position_gain
 
+    @property
+    def gives_accelerations(self) -> bool:
+        """Whether it says how noisy accelerations are."""
+        return self.acceleration is not None or self.acceleration_gain > 0.0
+
+    @property
+    def left(self) -> StateNoise:
+        """Noise of accelerations whose configuration is known, as the `covariance` of one of its own."""
+        if self.acceleration is not None:
+            return StateNoise(self.acceleration)
+        return StateNoise(max(self.left_gain, 0.0) * self.covariance)
+
     def part(self, index: IntArray) -> FloatArray:
         """``Sigma`` of some components, in the shape it has."""
         return self.covariance[..., index, :][..., index] if self.full else self.covariance[..., index]
 
     def select(self, frames: IntArray | slice | BoolArray) -> StateNoise:
         """Of some of the frames."""
-        return replace(self, covariance=self.covariance[frames]) if self.varies else self
+        out = replace(self, covariance=self.covariance[frames]) if self.varies else self
+        if self.acceleration is not None and self.acceleration.ndim == 3:
+            out = replace(out, acceleration=self.acceleration[frames])
+        return out
 
     def check(self, size: int, frames: int) -> None:
         """Raise `InputError` when it does not belong to a motion of so many components and frames."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from factorgrasp.recordings.tables import PathLike, read_table
 from factorgrasp.typing import FloatArray
 
 GROUND = "ground"
-_FORCE, _POINT, _MOMENT = ("fx", "fy", "fz"), ("px", "py", "pz"), ("mx", "my", "mz")
+FORCE, POINT, MOMENT = ("fx", "fy", "fz"), ("px", "py", "pz"), ("mx", "my", "mz")
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,25 +186,32 @@ def read_force_table(path: PathLike, link: str, name: str = "") -> ForceRecordin
     Units may be declared (``px [mm]``, ``mz [N mm]``). Without ``px,py,pz`` moments are about the ground's origin; without
     ``mx,my,mz`` there is no free moment.
     """
-    optional = (*_POINT, *_MOMENT)
-    table = read_table(path, ("t", *_FORCE), optional)
-    for group in (_POINT, _MOMENT):
-        missing = [key for key in group if key not in table]
+    optional = (*POINT, *MOMENT)
+    table = read_table(path, ("t", *FORCE), optional)
+    return force_of(path, table["t"], table, link, name)
+
+
+def force_of(
+    path: PathLike, t: FloatArray, columns: Mapping[str, FloatArray], link: str, name: str = ""
+) -> ForceRecording:
+    """A force from columns ``fx`` to ``mz``; without a point it acts at the ground's origin, without a moment there is none."""
+    for group in (POINT, MOMENT):
+        missing = [key for key in group if key not in columns]
         if missing and len(missing) < 3:
             raise InputError(f"{path}: columns", ", ".join(group), ", ".join(missing) + " missing")
 
     def part(names: tuple[str, ...]) -> FloatArray:
-        if names[0] not in table:
-            return np.zeros((table["t"].size, 3))
-        return np.column_stack([table[key] for key in names])
+        if names[0] not in columns:
+            return np.zeros((t.size, 3))
+        return np.column_stack([columns[key] for key in names])
 
-    return ForceRecording(table["t"], part(_FORCE), part(_POINT), part(_MOMENT), link, name)
+    return ForceRecording(t, part(FORCE), part(POINT), part(MOMENT), link, name)
 
 
 def read_wrench_table(path: PathLike) -> tuple[FloatArray, FloatArray]:
     """Times (n,) and wrenches (n, 6) ``[fx fy fz mx my mz]`` of a force/torque sensor, in the sensor's frame, from a table."""
-    table = read_table(path, ("t", *_FORCE, *_MOMENT))
-    return table["t"], np.column_stack([table[key] for key in (*_FORCE, *_MOMENT)])
+    table = read_table(path, ("t", *FORCE, *MOMENT))
+    return table["t"], np.column_stack([table[key] for key in (*FORCE, *MOMENT)])
 
 
 def _text(element: ElementTree.Element, key: str) -> str:

@@ -5,6 +5,7 @@ The motion itself is read by :func:`factorgrasp.problems.link_motion_files.load_
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,15 @@ from factorgrasp.recordings.forces import ForceRecording
 from factorgrasp.recordings.opensim import CoordinateTable
 from factorgrasp.recordings.tables import PathLike
 from factorgrasp.typing import FloatArray
+
+
+def has_link_forces(path: PathLike) -> bool:
+    """Whether an archive holds the forces that :func:`read_link_forces` reads."""
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            return "grf" in archive and "grf_body" in archive
+    except (ValueError, OSError, zipfile.BadZipFile):
+        return False
 
 
 def read_link_forces(path: PathLike) -> tuple[ForceRecording, ...]:
@@ -62,7 +72,7 @@ def _fields(path: PathLike, needed: tuple[str, ...]) -> dict[str, np.ndarray]:
                     str(file), "the fields " + ", ".join(needed), ", ".join(missing) + " missing"
                 )
             return {name: archive[name] for name in needed}
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, zipfile.BadZipFile) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(str(file), "an archive of numpy arrays (.npz)", str(error)) from error

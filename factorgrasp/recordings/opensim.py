@@ -7,6 +7,7 @@ stays one.
 from __future__ import annotations
 
 import re
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
@@ -88,6 +89,15 @@ class CoordinateTable:
     names: tuple[str, ...]
     values: FloatArray
     translations: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class OsimMarker:
+    """A marker of an OpenSim model: its name, the body that carries it, and where (m, in the body's frame)."""
+
+    name: str
+    link: str
+    position: tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -262,6 +272,44 @@ def read_trc(path: PathLike) -> MarkerRecording:
         _validate.read_only(position),
         float(declared["DataRate"]),
     )
+
+
+def read_osim_markers(path: PathLike) -> tuple[OsimMarker, ...]:
+    """Markers of an OpenSim model (.osim), of version 3 or 4.
+
+    Raises
+    ------
+    InputError
+        For a file that is none, without markers, or with a marker that lacks its body or its place.
+    """
+    file = Path(path)
+    _lines(file)
+    try:
+        root = ElementTree.parse(file).getroot()
+    except ElementTree.ParseError as error:
+        raise InputError(str(file), "an OpenSim model (.osim)", str(error)) from error
+    out = []
+    for element in root.iter("Marker"):
+        name = element.get("name", "")
+        link = next(
+            (
+                text
+                for key in ("socket_parent_frame", "socket_parent_frame_connectee_name", "body")
+                if (text := (element.findtext(key) or "").strip())
+            ),
+            "",
+        )
+        words = (element.findtext("location") or "").split()
+        try:
+            x, y, z = (float(word) for word in words)
+        except ValueError:
+            raise InputError(f"{file}: marker {name}, location", "three numbers", " ".join(words)) from None
+        if not name or not link:
+            raise InputError(f"{file}: marker {name}", "a name and a body", "none")
+        out.append(OsimMarker(name, link.rpartition("/")[2], (x, y, z)))
+    if not out:
+        raise InputError(str(file), "a model with markers", "none")
+    return tuple(out)
 
 
 def _lines(file: Path) -> list[str]:

@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import argparse
+import io
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -25,6 +26,7 @@ from factorgrasp.problems.human_dynamics_settings import HumanDynamicsNoise
 from factorgrasp.simulation.human_dynamics import (
     FEET,
     HANDS,
+    Carrying,
     HumanRecording,
     human_bowing,
     human_carrying,
@@ -38,6 +40,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PAGE = "human_dynamics.md"
+DPI = 120
 ARM = ("jRightShoulder", "jRightElbow", "jRightWrist")
 HAND_COVARIANCE = (1e4, 1e4, 1e4, 1.0, 1.0, 1.0)
 """Of unmeasured contacts: forces free, moments about where the hand holds small."""
@@ -267,12 +270,16 @@ def _ideal_tpose(recording: HumanRecording, payload: float) -> FloatArray:
 
 
 def hand_covariances(seed: int = 0) -> Shown:
-    """Tirupachuri 2021, figs. 11 to 14: the mass in the hand (5 kg) for covariances of the hand's force."""
+    """Tirupachuri 2021, figs. 11 to 14: force on the hand and mass in it (5 kg) for covariances of the hand's force."""
     recording = human_tpose(seed, payload=5.0)
     motion, keep, own = recording.measured_motion
     during = recording.during("T-pose")[keep]
     feet = recording.foot_sensors(motion, keep)
-    rows, curves = [], []
+    upright = motion.R[:, motion.link("RightHand"), 2]
+    rows = []
+    curves: dict[str, list[tuple[str, FloatArray, str]]] = {
+        key: [] for key in ("f joint", "f paper", "m joint", "m paper")
+    }
     for variance, colour in zip((1e-4, 1e-2, 1.0, 1e2, 1e4), ("x", "accent", "y", "z", "ink"), strict=True):
         noise = replace(own, contact_wrench=(variance,) * 3 + (1e4,) * 3)
         paper = ExternalWrenches(
@@ -282,25 +289,33 @@ def hand_covariances(seed: int = 0) -> Shown:
             replace(noise, free_wrench=1e-6),
             1e-3,
         ).estimate()
-        force = np.linalg.norm(paper.of("RightHand")[:, :3], axis=1) / 9.80665
         ours, _ = solve_recording(recording, noise, ("RightHand",), ("RightHand",))
         assert ours.payload is not None
-        unshrunk = ours.payload.mass[during]
-        joint = (
-            np.linalg.norm(ours.frames.external_wrench[:, ours.frames.links.index("RightHand"), :3], axis=1)
-            / 9.80665
-        )
+        found = {
+            "paper": paper.of("RightHand")[:, :3],
+            "joint": ours.frames.external_wrench[:, ours.frames.links.index("RightHand"), :3],
+        }
+        mass = {key: np.linalg.norm(force, axis=1) / 9.80665 for key, force in found.items()}
         rows.append(
             (
                 f"{variance:.0e}",
-                f"{force[during].mean():.2f}",
-                f"{joint[during].mean():.2f}",
-                f"{np.nanmean(unshrunk):.2f}",
+                f"{mass['paper'][during].mean():.2f}",
+                f"{mass['joint'][during].mean():.2f}",
+                f"{np.nanmean(ours.payload.mass[during]):.2f}",
             )
         )
-        curves.append((f"{variance:.0e}", force, colour))
-    made, (ax,) = plots.figure(7.2, 2.4)
-    _curves(ax, "Mass from the hand's force, by its covariance (N²)", "kg", recording.t[keep], curves)
+        for key, force in found.items():
+            curves[f"f {key}"].append((f"{variance:.0e}", np.sum(upright * force, axis=1), colour))
+            curves[f"m {key}"].append((f"{variance:.0e}", mass[key], colour))
+    made, axes = plots.figure(7.2, 4.6, rows=2, columns=2)
+    titles = {
+        "f joint": ("Upright force on the hand, one estimate (cf. Fig. 11)", "N"),
+        "f paper": ("With the non-collocated step (Fig. 13)", "N"),
+        "m joint": ("Its mass (cf. Fig. 12)", "kg"),
+        "m paper": ("Its mass (Fig. 14)", "kg"),
+    }
+    for ax, (key, (title, unit)) in zip(axes, titles.items(), strict=True):
+        _curves(ax, title, unit, recording.t[keep], curves[key])
     header = (
         "covariance of the hand's force (N²)",
         "non-collocated, feet 1e-6, momentum 1e-3 (kg)",
@@ -322,6 +337,7 @@ def feet_covariances(seed: int = 0) -> Shown:
     measured = recording.foot_sensors(motion, keep)
     index = [motion.link(sensor.link) for sensor in measured]
     rows, curves = [], []
+    tracked: list[tuple[str, FloatArray, str]] = []
     for variance, colour in zip((1e-6, 1e-4, 1e-2, 1.0, 1e2), ("ink", "z", "y", "accent", "x"), strict=True):
         result = HumanDynamicsTask(
             motion, [replace(s, covariance=variance) for s in measured], noise=noise
@@ -335,10 +351,12 @@ def feet_covariances(seed: int = 0) -> Shown:
         off = [np.linalg.norm(part, axis=2) for part in (force - values[..., :3], moment - values[..., 3:])]
         rows.append((f"{variance:.0e}", *(f"{np.sqrt(np.mean(part**2)):.3g}" for part in off)))
         curves.append((f"{variance:.0e}", off[0][:, 0], colour))
-    made, (ax,) = plots.figure(7.2, 2.4)
-    _curves(
-        ax, "Right foot, estimate less measurement, by covariance", "N", recording.t[keep], curves, log=True
-    )
+        if variance == 1e-6:
+            tracked = [("estimate", force[:, 0, 2], "z"), ("measurement", values[:, 0, 2], "ink")]
+    made, (ax, close) = plots.figure(7.2, 2.6, columns=2)
+    t = recording.t[keep]
+    _curves(ax, "Right foot: estimate less measurement (Fig. 8)", "N", t, curves, log=True)
+    _curves(close, "Right foot, upright force, 1e-6 (Fig. 9)", "N", t, tracked, dashed=1)
     return Shown(
         ("covariance of the feet (N², (Nm)²)", "force, RMS difference (N)", "moment, RMS difference (Nm)"),
         tuple(rows),
@@ -349,8 +367,9 @@ def feet_covariances(seed: int = 0) -> Shown:
 def carrying(seed: int = 0) -> Shown:
     """Tirupachuri 2021, figs. 17 and 18: 9.55 kg in both hands while standing, on one foot and walking."""
     rows = []
-    made, axes = plots.figure(7.2, 4.0, rows=2)
-    for motion in ("standing", "one_foot", "walking"):
+    made, axes = plots.figure(7.2, 6.2, rows=3, columns=2)
+    motions: tuple[Carrying, ...] = ("standing", "one_foot", "walking")
+    for row, motion in enumerate(motions):
         recording = human_carrying(seed, motion=motion)
         result, keep = solve_recording(recording, contacts=HANDS, payload=HANDS)
         assert result.payload is not None
@@ -367,17 +386,23 @@ def carrying(seed: int = 0) -> Shown:
                     f"{np.median(sd[during]):.2f}",
                 )
             )
-        if motion != "standing":
-            ax = axes[0] if motion == "one_foot" else axes[1]
-            t = recording.t[keep]
-            _curves(
-                ax,
-                f"Mass in both hands, {motion.replace('_', ' ')}",
-                "kg",
-                t,
-                [("feet minus body", paper, "x"), ("estimate", mass, "z")],
-            )
-            ax.axhline(9.55, color=plots.PALETTE["ink"], linewidth=0.8)
+        t, name = recording.t[keep], motion.replace("_", " ")
+        hands = [result.frames.links.index(link) for link in HANDS]
+        force = np.einsum(
+            "nlj,nlj->nl", result.rotation[:, hands, 2], result.frames.external_wrench[:, hands, :3]
+        )
+        _curves(
+            axes[2 * row], f"{name}: upright force on the hands", "N", t,
+            [("right", force[:, 0], "x"), ("left", force[:, 1], "z")],
+        )  # fmt: skip
+        _curves(
+            axes[2 * row + 1],
+            f"{name}: mass",
+            "kg",
+            t,
+            [("feet less body", paper, "x"), ("estimate", mass, "z")],
+        )
+        axes[2 * row + 1].axhline(9.55, color=plots.PALETTE["ink"], linewidth=0.8)
     header = ("phase", "force of the feet less the body (kg)", "estimate (kg)", "stated sd of a frame (kg)")
     return Shown(header, tuple(rows), made)
 
@@ -415,13 +440,21 @@ def write_page(folder: Path, names: Sequence[str] = tuple(FIGURES)) -> list[Path
         content = shown.markdown()
         text = place.sub(_put(content), text)
         if shown.figure is not None:
-            path = folder / "figures" / f"human_dynamics_{name}.svg"
+            path = folder / "figures" / f"human_dynamics_{name}.png"
             with replacing(path) as temporary:
-                shown.figure.savefig(
-                    temporary, format="svg", facecolor=plots.PALETTE["paper"], metadata={"Date": None}
-                )
+                _write_png(shown.figure, temporary)
             written.append(path)
     return [*written, write_text(page, text)]
+
+
+def _write_png(made: Figure, path: Path) -> None:
+    """A picture of few colours, which lines and axes are: a third of the size."""
+    from PIL import Image
+
+    stream = io.BytesIO()
+    made.savefig(stream, format="png", dpi=DPI, facecolor=plots.PALETTE["paper"])
+    with Image.open(stream) as picture:
+        picture.convert("RGB").quantize(48).save(path, format="png", optimize=True)
 
 
 def _put(content: str) -> Callable[[re.Match[str]], str]:
@@ -454,9 +487,11 @@ def _curves(
     t: FloatArray,
     curves: Sequence[tuple[str, FloatArray, str]],
     log: bool = False,
+    dashed: int = -1,
 ) -> None:
-    for label, values, colour in curves:
-        ax.plot(t, values, color=plots.PALETTE[colour], label=label, linewidth=1.0)
+    for k, (label, values, colour) in enumerate(curves):
+        style = (0, (3, 3)) if k == dashed else "-"
+        ax.plot(t, values, color=plots.PALETTE[colour], label=label, linewidth=1.0, linestyle=style)
     ax.set_title(title)
     ax.set_ylabel(unit)
     ax.set_xlabel("time (s)")

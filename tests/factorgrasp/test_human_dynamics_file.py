@@ -168,7 +168,7 @@ def test_command_line_writes_everything(folder: Path, tmp_path: Path) -> None:
             "[constraints.torque_limits]\njRightNee = 5\n",
             "jRightNee.*Did you mean jRightKnee",
         ),
-        (("[model]", "[model]"), '[[sensors]]\ntype = "gyro"\n', r"\[\[sensors\]\] 1 type"),
+        (("[model]", "[model]"), '[[sensors]]\ntype = "giro"\n', r"\[\[sensors\]\] 1 type"),
         (("angle_sd = 0.001", "angle_sd = 0"), "", r"\[motion\] angle_sd"),
         (("angle_sd = 0.001", "[motion.columns]\njHed = 'x'"), "", r"\[motion.columns\] jHed"),
     ],

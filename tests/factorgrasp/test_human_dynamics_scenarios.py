@@ -176,7 +176,7 @@ def test_page_is_renewed_in_its_places(tmp_path: Path, monkeypatch: pytest.Monke
     assert text.endswith("after\n")
     assert "old" not in text
     assert "| 1e-04 |" in text
-    assert {path.suffix for path in written} == {".svg", ".md"}
+    assert {path.suffix for path in written} == {".png", ".md"}
     with pytest.raises(InputError, match="one of robustness"):
         figures.write_page(tmp_path, ["nothing"])
     with pytest.raises(InputError, match="a place for robustness"):
