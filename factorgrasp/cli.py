@@ -228,6 +228,7 @@ def _takes(capabilities: Capabilities) -> str:
         "inequalities": capabilities.inequalities,
         "nonlinear": capabilities.nonlinear,
         "warm start": capabilities.warm_start,
+        "nonlinear programs": capabilities.program,
     }
     return ", ".join(word for word, there in words.items() if there)
 

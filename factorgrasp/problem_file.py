@@ -14,6 +14,9 @@ from factorgrasp.errors import InputError
 from factorgrasp.problem import Problem
 from factorgrasp.toml_tables import close_matches, describe
 
+SOLVER_TABLES = ("excitation",)
+"""Kinds whose file may have a table [solver], with the name in it, in place of the name alone."""
+
 Builder: TypeAlias = Callable[[Mapping[str, Any], Path], Problem]
 """Makes the problem from the tables of its file, and the folder that the file's paths are relative to."""
 
@@ -79,8 +82,11 @@ def load_problem(path: str | os.PathLike[str]) -> ProblemFile:
     table = read_toml(file)
     try:
         kind = _required_kind(table)
-        words = {key: _string(table, key) for key in ("title", "solver") if key in table}
         rest = {key: value for key, value in table.items() if key not in COMMON_KEYS}
+        if kind in SOLVER_TABLES and isinstance(table.get("solver"), Mapping):
+            rest["solver"] = table["solver"]
+            table = {**table, "solver": table["solver"].get("name", "")}
+        words = {key: _string(table, key) for key in ("title", "solver") if table.get(key, "") != ""}
         problem = _builder(kind)(rest, file.parent)
     except InputError as error:
         raise InputError(f"{file}: {error.field}", error.expected, error.found, error.hint) from error

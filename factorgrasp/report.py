@@ -25,6 +25,7 @@ BUILDERS: dict[str, str] = {
     "grasp_pose_from_poses": "factorgrasp.grasp_report:build_from_poses",
     "human_dynamics": "factorgrasp.human_dynamics_report:build",
     "excitation_evaluation": "factorgrasp.excitation_evaluation_report:build",
+    "excitation": "factorgrasp.excitation_report:build",
 }
 """``"module:function"`` of the builder of a kind; it takes the typed view of an estimate and returns a :class:`Report`."""
 

@@ -76,4 +76,5 @@ def write_all(
     (directory / REPORT_NAME).unlink(missing_ok=True)
     estimate.save(directory)
     report = write_report(estimate, directory / REPORT_NAME, title, source, remarks)
-    return [directory / JSON_NAME, directory / NPZ_NAME, report]
+    more = [directory / name for name in getattr(estimate, "files", ())]
+    return [directory / JSON_NAME, directory / NPZ_NAME, *more, report]

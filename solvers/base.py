@@ -23,6 +23,8 @@ class Capabilities:
     nonlinear: bool = False
     warm_start: bool = False
     sparse: bool = True
+    program: bool = False
+    """Takes a :class:`factorgrasp.nonlinear_program.NonlinearProgram` (and no least squares)."""
 
 
 @dataclass(frozen=True)

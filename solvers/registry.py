@@ -18,6 +18,9 @@ SOLVERS: dict[str, str] = {
     "gtsam-gauss-newton": "factorgrasp.solvers.gtsam_nonlinear:GtsamGaussNewton",
     "gtsam-levenberg-marquardt": "factorgrasp.solvers.gtsam_nonlinear:GtsamLevenbergMarquardt",
     "gtsam-isam2": "factorgrasp.solvers.gtsam_nonlinear:GtsamIsam2",
+    "ipopt": "factorgrasp.solvers.nlp_casadi:Ipopt",
+    "fatrop": "factorgrasp.solvers.nlp_casadi:Fatrop",
+    "sqpmethod": "factorgrasp.solvers.nlp_casadi:SqpMethod",
 }
 """``"module:Class"`` of every solver by its name, imported when it is asked for. What follows the colon may also be a function that makes
 the class for a name (how one file serves all backends of qpsolvers)."""
