@@ -34,7 +34,14 @@ from factorgrasp.status import Status
 from factorgrasp.toml_tables import check_keys, convert, from_table, get, place, sub_table
 from factorgrasp.typing import FloatArray
 
-TABLES = ("evaluate", "robot", "grasp", "human", "noise", "estimate", "prior")
+TABLES = ("evaluate", "robot", "grasp", "human", "noise", "estimate", "prior", "excitation", "solver")
+"""[excitation] and [solver] belong to the plan that the trajectory comes from: with [evaluate] added its file evaluates it."""
+# Of the plan's human, too: what the wrist wants to do is in the trajectory already.
+_HUMAN = (
+    "force_stiffness", "moment_stiffness", "comfort_force", "comfort_moment", "max_rotation", "max_force", "max_moment", "mode",
+    "position", "rotation_wxyz", "waypoints", "travel", "turn", "goal_position", "goal_rotation_wxyz", "file",
+)  # fmt: skip
+_ASKED = ("window", "alpha", "rotation_sd", "translation_sd")
 Reference = Literal["start", "mean"]
 # Hz. Arms move below this; jittered stamps, interpolated, add noise above it that no estimate of white noise takes out.
 _BANDWIDTH = 10.0
@@ -210,17 +217,17 @@ def build_evaluation(table: Mapping[str, Any], base_dir: Path) -> ExcitationEval
     evaluate, robot = sub_table(table, "evaluate", required=True), sub_table(table, "robot")
     check_keys(
         evaluate,
-        ("file", "columns", "check_units", "window", "alpha", "rotation_sd", "translation_sd", "reference"),
+        ("file", "columns", "check_units", "reference", *_ASKED),
         "[evaluate]",
     )
-    check_keys(robot, ("urdf", "frame", "gravity"), "[robot]")
-    demands = from_table(
-        Demands,
-        {k: evaluate[k] for k in ("window", "alpha", "rotation_sd", "translation_sd") if k in evaluate},
-        "[evaluate]",
-    )
+    if "excitation" in table:
+        _check_plan(table)
+    else:
+        check_keys(robot, ("urdf", "frame", "gravity"), "[robot]")
+    asked = {**sub_table(table, "excitation"), **evaluate}
+    demands = from_table(Demands, {key: asked[key] for key in _ASKED if key in asked}, "[evaluate]")
     reference = get(evaluate, "reference", Reference, "[evaluate]", "start")
-    rotation, translation, known = _grasp(sub_table(table, "grasp"))
+    rotation, translation, known = _grasp(sub_table(table, "grasp"), base_dir)
     noise = from_table(GraspNoise, sub_table(table, "noise"), "[noise]")
     settings = from_table(GraspSettings, sub_table(table, "estimate"), "[estimate]")
     gravity = get(robot, "gravity", _Three, "[robot]", (0.0, 0.0, -9.80665))
@@ -318,26 +325,28 @@ def _read_arrays(path: Path, check_units: bool) -> tuple[JointStream, FloatArray
     return stream, arrays.get("tau")
 
 
-def _grasp(table: Mapping[str, Any]) -> tuple[FloatArray, FloatArray, FloatArray | None]:
-    where = "[grasp]"
-    check_keys(table, ("rotation_wxyz", "translation", "covariance"), where)
-    q = np.array(get(table, "rotation_wxyz", _Four, where, (1.0, 0.0, 0.0, 0.0)))
-    norm = float(np.linalg.norm(q))
-    if abs(norm - 1.0) > 1e-2:
-        raise InputError("[grasp] rotation_wxyz", "a unit quaternion [w, x, y, z]", f"norm {norm:.6g}")
-    translation = np.array(get(table, "translation", _Three, where, (0.0, 0.0, 0.0)))
-    if "covariance" not in table:
-        return quaternion_wxyz_to_matrix(q / norm), translation, None
-    six = tuple[float, float, float, float, float, float]
-    P = np.array(convert(table["covariance"], tuple[six, six, six, six, six, six], "[grasp] covariance"))
-    if np.max(np.abs(P - P.T)) > 1e-9 * np.abs(P).max() or np.linalg.eigvalsh(P)[0] <= 0.0:
-        raise InputError("[grasp] covariance", "a symmetric, positive definite matrix (6, 6)", "another one")
-    return quaternion_wxyz_to_matrix(q / norm), translation, P
+def _check_plan(table: Mapping[str, Any]) -> None:
+    """The tables that describe a plan: what they ask for is read, how it was found is not."""
+    from factorgrasp.problems.excitation_settings import ExcitationSettings
+
+    from_table(ExcitationSettings, sub_table(table, "excitation"), "[excitation]")
+
+
+def _grasp(table: Mapping[str, Any], base_dir: Path) -> tuple[FloatArray, FloatArray, FloatArray | None]:
+    """The grasp at which the motion is judged, and its covariance where the file states one."""
+    from factorgrasp.excitation_file import read_grasp
+
+    if not table:
+        return np.eye(3), np.zeros(3), None
+    stated_place = "translation" in table or "estimate" in table
+    belief = read_grasp(table if stated_place else {**table, "translation": [0.0, 0.0, 0.0]}, base_dir)
+    stated = any(key in table for key in ("estimate", "covariance", "rotation_sd", "translation_sd"))
+    return belief.rotation, belief.translation, belief.covariance if stated else None
 
 
 def _wrist(table: Mapping[str, Any]) -> WristStiffness:
     where = "[human]"
-    check_keys(table, ("force_stiffness", "moment_stiffness"), where)
+    check_keys(table, _HUMAN, where)
     known = WristStiffness()
     return WristStiffness(
         get(table, "force_stiffness", float, where, known.translation),

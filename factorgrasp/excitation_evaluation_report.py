@@ -161,8 +161,22 @@ def _joints(result: ExcitationEvaluation) -> Section:
         rows.append(tuple(row))
     if correlation is not None:
         header = (*header, "correlation with measured torque")
+    shares = {}
+    for k, name in enumerate(joints.names):
+        for what, peak, limit in (
+            ("speed", margins[name]["peak_velocity"], joints.velocity_limits[k]),
+            ("torque", margins[name]["peak_torque"], joints.torque_limits[k]),
+        ):
+            if np.isfinite(limit):
+                shares[f"{name} {what}"] = float(peak / limit)
+    svg = ""
+    if shares:
+        made, axes = plots.figure(7.2, 0.4 + 0.2 * len(shares))
+        excitation_plots.draw_margins(axes[0], shares)
+        svg = plots.to_svg(made, "joints")
     return Section(
         "Joints",
         "Torques are those of the rigid-body model; friction is not in it.",
+        svg=svg,
         table=Table(header, tuple(rows)),
     )

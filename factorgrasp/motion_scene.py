@@ -76,7 +76,8 @@ class MotionScene:
         import pinocchio
 
         index = model.getFrameId(frame) if isinstance(frame, str) else frame
-        chain = list(model.supports[model.frames[index].parentJoint])
+        # Without the universe, which the pictures add as the base.
+        chain = [joint for joint in model.supports[model.frames[index].parentJoint] if joint]
         data = model.createData()
         skeleton = np.empty((t.size, len(chain) + 1, 3))
         position, rotation = np.empty((t.size, 3)), np.empty((t.size, 3, 3))

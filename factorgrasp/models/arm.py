@@ -85,6 +85,34 @@ class Arm:
             f"{np.degrees(np.linalg.norm(error[3:])):.2f} deg remain"
         )
 
+    def follow(self, rotations: FloatArray, positions: FloatArray, q: FloatArray) -> FloatArray:
+        """Configurations (n, joints) along poses (n, 3, 3) and (n, 3), each by the smallest step from the one before; the first from `q`.
+
+        Raises
+        ------
+        InfeasibleError
+            Where a pose is out of reach, or a joint would have to leave its limits.
+        """
+        import pinocchio
+
+        model, data, here = self.model, self.model.createData(), np.array(q, dtype=float)
+        low, high = np.array(model.lowerPositionLimit), np.array(model.upperPositionLimit)
+        out = np.empty((positions.shape[0], model.nq))
+        for k, (rotation, position) in enumerate(zip(rotations, positions, strict=True)):
+            target = pinocchio.SE3(rotation, position)
+            for _ in range(50):
+                pinocchio.computeJointJacobians(model, data, here)
+                at = pinocchio.updateFramePlacement(model, data, self.frame)
+                error = pinocchio.log6(at.actInv(target)).vector
+                if np.linalg.norm(error) < 1e-11:
+                    break
+                J = pinocchio.getFrameJacobian(model, data, self.frame, pinocchio.LOCAL)
+                here = here + J.T @ np.linalg.solve(J @ J.T + 1e-9 * np.eye(6), error)
+            if np.linalg.norm(error) > 1e-8 or np.any(here < low) or np.any(here > high):
+                raise InfeasibleError(f"the {self.name} cannot follow pose {k} within its joint limits")
+            out[k] = here
+        return out
+
 
 def panda_urdf() -> Path | None:
     """The Panda of example-robot-data (extra ``robots``); None when it is not installed."""

@@ -148,7 +148,9 @@ def _line(ax: Axes, t: FloatArray, values: FloatArray, colour: str, label: str) 
 
 @plots.styled
 def _dress(ax: Axes, title: str, unit: str) -> None:
-    ax.set_yscale("log")
+    # Before the first estimate there is nothing to draw, and nothing has no logarithm.
+    if any(np.any(np.asarray(line.get_ydata(), dtype=float) > 0.0) for line in ax.lines):
+        ax.set_yscale("log")
     ax.set_title(title)
     ax.set_ylabel(unit)
 
