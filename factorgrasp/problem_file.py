@@ -12,6 +12,7 @@ from typing import Any, TypeAlias, cast
 
 from factorgrasp.errors import InputError
 from factorgrasp.problem import Problem
+from factorgrasp.threads import one_blas_thread
 from factorgrasp.toml_tables import close_matches, describe
 
 SOLVER_TABLES = ("excitation",)
@@ -54,6 +55,7 @@ class ProblemFile:
     title: str = ""
     solver: str | None = None
 
+    @one_blas_thread()
     def solve(self, solver: str | None = None) -> Any:
         """The typed view of the estimate; `solver` goes before the one that the file asks for."""
         chosen = solver or self.solver

@@ -15,9 +15,11 @@ from factorgrasp.solvers.make_estimate import make_estimate
 from factorgrasp.solvers.native import native_descent
 from factorgrasp.solvers.outer_loop import LoopOptions, LoopResult, solve_linear, solve_nonlinear
 from factorgrasp.solvers.registry import QP_PREFERENCE, get_solver, solver_class
+from factorgrasp.threads import one_blas_thread
 from factorgrasp.typing import State
 
 
+@one_blas_thread()
 def solve(
     problem: LinearProblem | NonlinearProblem | LeastSquares,
     solver: str | Solver | None = None,
