@@ -20,8 +20,12 @@ from factorgrasp.typing import BoolArray, FloatArray
 
 POSTURE_SD = 1.0
 """Rad: how far joints are from the zero configuration, for what nothing else tells of."""
-WINDOW, OVERLAP = 300, 45
-"""Frames that are smoothed at once, and frames that neighbouring windows share: together they bound the memory."""
+WINDOW = 300
+"""Frames that are smoothed at once, as long as they are four times the overlap: that bounds the memory."""
+OVERLAP = 0.5
+"""s that a window reaches beyond what is kept of it: by then the motion prior has forgotten."""
+WHOLE = 1500
+"""Frames up to which every frame's covariances are kept whole; beyond, that would fill the memory."""
 _CHUNK = 128
 # Information that holds what cannot move.
 _HELD = 1e12
@@ -45,7 +49,12 @@ class BodyState:
         (n, nq), (n, nv), (n, nv), as pinocchio has them; NaN in frames that are not `good`.
     q_variance, qd_variance, qdd_variance : ndarray, shape (n, nv)
         Of every component; those of a free-flyer's translation along the world's axes.
-    q_covariance, qdd_covariance : ndarray, shape (n, nv, nv)
+    q_covariance : ndarray, shape (m, nv, nv)
+        Of the first m frames: all of them up to :data:`WHOLE`.
+    qdd_covariance : ndarray, shape (n, nv, nv) or (nv, nv)
+        The mean over all frames of a recording longer than :data:`WHOLE`.
+    root_covariance : ndarray, shape (n, 3, 3)
+        Of the first three components: a free-flyer's place in the world.
     good : ndarray, shape (n,)
         False where too little was seen to tell the whole configuration, and at both ends.
     residual_sd : float
@@ -65,6 +74,7 @@ class BodyState:
     qdd_variance: FloatArray
     q_covariance: FloatArray
     qdd_covariance: FloatArray
+    root_covariance: FloatArray
     good: BoolArray
     residual_sd: float
     worst_marker: tuple[str, float]
@@ -118,14 +128,15 @@ def estimate_state(
     q = _frame_by_frame(body, observations, rest, pull)
     variance = _information_variance(body, q, pull)
     jerk, _ = jerk_scale(_unrolled(body, q), variance, dt, bandwidth)
-    q, Q, qd2, A = _smooth(body, q, rest, pull, jerk, dt)
+    smooth = _smooth(body, q, rest, pull, jerk, dt)
+    q, Q = smooth.q, smooth.Q
     v, a = body.derivatives(q, dt)
     good = _told(body, q, pull, variance, round(max_gap / dt))
     good[[0, -1]] = False
     q, v, a = (np.where(good[:, None], x, np.nan) for x in (q, v, a))
     ratio, worst = _fit(body, observations, q, Q, good)
     return BodyState(
-        t, q, v, a, np.diagonal(Q, axis1=1, axis2=2).copy(), qd2, np.diagonal(A, axis1=1, axis2=2).copy(), Q, A, good, ratio, worst, jerk
+        t, q, v, a, smooth.q2, smooth.qd2, smooth.qdd2, Q, smooth.A, smooth.root, good, ratio, worst, jerk
     )  # fmt: skip
 
 
@@ -286,22 +297,48 @@ def _unrolled(body: Observed, q: FloatArray) -> FloatArray:
 # ---- over time --------------------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True, eq=False)
+class _Smooth:
+    """Configurations, their variances and those of both derivatives, and covariances as far as they are kept."""
+
+    q: FloatArray
+    q2: FloatArray
+    qd2: FloatArray
+    qdd2: FloatArray
+    Q: FloatArray
+    A: FloatArray
+    root: FloatArray
+
+
 def _smooth(
     body: Observed, q: FloatArray, rest: FloatArray, pull: FloatArray, jerk: FloatArray, dt: float
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    count = len(q)
-    out, nv = q.copy(), body.nv
-    Q, qd2, A = np.empty((count, nv, nv)), np.empty((count, nv)), np.empty((count, nv, nv))
-    step = WINDOW - 2 * OVERLAP
-    for begin in range(0, count, step) if count > WINDOW else (0,):
-        low, high = max(0, begin - OVERLAP), min(count, begin + step + OVERLAP)
-        if count <= WINDOW:
+) -> _Smooth:
+    count, nv = len(q), body.nv
+    whole = count <= WHOLE
+    overlap = int(np.clip(round(OVERLAP / dt), 30, 120))
+    window = max(WINDOW, 4 * overlap)
+    step = window - 2 * overlap
+    out, root = q.copy(), np.empty((count, min(3, nv), min(3, nv)))
+    q2, qd2, qdd2 = (np.empty((count, nv)) for _ in range(3))
+    Q = np.empty((count if whole else step, nv, nv))
+    A = np.zeros((count, nv, nv) if whole else (nv, nv))
+    for begin in range(0, count, step) if count > window else (0,):
+        low, high = max(0, begin - overlap), min(count, begin + step + overlap)
+        if count <= window:
             low, high = 0, count
         part, C, v2, a2 = _smooth_window(body, q[low:high], slice(low, high), rest, pull, jerk, dt)
-        keep = slice(begin, min(count, begin + step) if count > WINDOW else count)
+        keep = slice(begin, min(count, begin + step) if count > window else count)
         inside = slice(keep.start - low, keep.stop - low)
-        out[keep], Q[keep], qd2[keep], A[keep] = part[inside], C[inside], v2[inside], a2[inside]
-    return out, Q, qd2, A
+        out[keep], qd2[keep] = part[inside], v2[inside]
+        q2[keep], qdd2[keep] = (np.diagonal(x[inside], axis1=1, axis2=2) for x in (C, a2))
+        root[keep] = C[inside, :3, :3]
+        if keep.stop <= len(Q):
+            Q[keep] = C[inside]
+        if whole:
+            A[keep] = a2[inside]
+        else:
+            A += a2[inside].sum(axis=0) / count
+    return _Smooth(out, q2, qd2, qdd2, Q, A, root)
 
 
 def _smooth_window(
@@ -402,7 +439,7 @@ def _fit(
     body: Observed, observations: BodyObservations, q: FloatArray, Q: FloatArray, good: BoolArray
 ) -> tuple[float, tuple[str, float]]:
     """How well what was seen fits, in its own standard deviations, and what fits worst."""
-    frames = np.flatnonzero(good)
+    frames = np.flatnonzero(good[: len(Q)])
     if not frames.size:
         raise InputError("markers", "frames in which the whole configuration can be told", "none")
     frames = frames[:: max(1, frames.size // 200)]

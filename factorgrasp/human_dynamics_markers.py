@@ -364,15 +364,20 @@ def state_noise(state: BodyState, tree: PinocchioTree) -> StateNoise:
     Accelerations keep their correlations: joints that take turns in an error, as vertebrae between two markers do, move nothing else.
     """
     at = tree.tangent_columns
-    Q, A = state.q_covariance[state.good], state.qdd_covariance[state.good]
+    variance, A = state.q_variance[state.good].copy(), state.qdd_covariance
+    A = A[state.good] if A.ndim == 3 else A
     if tree.floating:
-        back = np.broadcast_to(np.eye(Q.shape[1]), Q.shape).copy()
         turn = lie.quaternion_wxyz_to_matrix(np.roll(state.q[state.good, 3:7], 1, axis=1))
-        back[:, :3, :3] = np.swapaxes(turn, 1, 2)
-        Q, A = (back @ C @ np.swapaxes(back, 1, 2) for C in (Q, A))
-    Q = np.diagonal(Q, axis1=1, axis2=2)[:, at]
-    A = A[:, at][:, :, at]
-    return StateNoise(Q, acceleration=0.5 * (A + np.swapaxes(A, 1, 2)) + 1e-10 * np.eye(at.size))
+        back = np.swapaxes(turn, 1, 2)
+        variance[:, :3] = np.diagonal(back @ state.root_covariance[state.good] @ turn, axis1=1, axis2=2)
+        if A.ndim == 3:
+            A = A.copy()
+            A[:, :3] = back @ A[:, :3]
+            A[:, :, :3] = A[:, :, :3] @ turn
+    A = A[..., at, :][..., at]
+    return StateNoise(
+        variance[:, at], acceleration=0.5 * (A + np.swapaxes(A, -1, -2)) + 1e-10 * np.eye(at.size)
+    )
 
 
 def _variances(model: Any, state: BodyState) -> dict[str, PerName]:

@@ -334,3 +334,48 @@ def test_too_little_is_an_error(walking: HumanRecording, seen: BodyObservations)
     blind = BodyObservations(seen.placement, np.full_like(seen.markers, np.nan))
     with pytest.raises(InputError, match="at least three"):
         estimate_state(model, t, blind)
+
+
+def test_suit_to_payload_by_the_command_line(tmp_path: Path) -> None:
+    """Poses of 18 segments: some vertebrae between them are free to share an error, which must not reach the mass."""
+    recording = human_carrying(0, motion="standing")
+    problem = write_recording(recording, tmp_path)
+    truth, rng = recording.truth.motion, np.random.default_rng(0)
+    parts = ("Shoulder", "UpperArm", "ForeArm", "Hand", "UpperLeg", "LowerLeg", "Foot")
+    sides = [f"{side}{part}" for part in parts for side in ("Right", "Left")]
+    links = ["Pelvis", "L3", "T8", "Head", *sides]
+    at = [truth.link(link) for link in links]
+    R = truth.R[:150][:, at]
+    R = R @ lie.so3_exp(0.005 * rng.normal(size=(R.shape[0] * R.shape[1], 3))).reshape(R.shape)
+    p = truth.p[:150][:, at] + 0.002 * rng.normal(size=(*R.shape[:2], 3))
+    np.savez(tmp_path / "suit.npz", t=recording.t[:150], bodies=np.array(["Hips", *links[1:]]), R=R, p=p)
+    text = problem.read_text(encoding="utf-8")
+    motion = '[motion]\nlinks = "suit.npz"\norientation_sd = 0.005\nposition_sd = 0.002\nbodies = { Hips = "Pelvis" }\n'
+    head = text[: text.index("[motion]")].rstrip() + "\ngravity = [0, 0, -9.80665]\n"
+    (tmp_path / "suit.toml").write_text(head + motion + text[text.index("[[forces]]") :], encoding="utf-8")
+    code, output = run(tmp_path / "suit.toml", tmp_path / "out")
+    assert code == 0, output
+    with np.load(tmp_path / "out" / "estimate.npz") as arrays:
+        assert np.nanmean(arrays["payload_mass"]) == pytest.approx(9.55, abs=0.25)
+
+
+def test_long_recordings_keep_means(
+    walking: HumanRecording, seen: BodyObservations, state: BodyState, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Windows and means of covariances give what the whole gives, where both exist."""
+    from factorgrasp import body_state
+
+    model, t, part = walking.body.model(), walking.t[FRAMES], seen
+    for name, value in (("WINDOW", 150), ("OVERLAP", 0.375), ("WHOLE", 100)):
+        monkeypatch.setattr(body_state, name, value)
+    pieces = estimate_state(model, t, part)
+    assert pieces.qdd_covariance.shape == (model.nv, model.nv)
+    assert pieces.q_covariance.shape == (76, model.nv, model.nv)
+    good = state.good & pieces.good
+    # Windows overlap by more than the prior remembers: differences are far below what is not known anyway.
+    error = ObservedBody(model, part).difference(state.q[good], pieces.q[good])
+    assert np.sqrt(np.mean(error**2 / state.q_variance[good])) < 0.1
+    assert np.median(pieces.q_variance / state.q_variance) == pytest.approx(1.0, abs=0.02)
+    assert np.median(np.diagonal(pieces.qdd_covariance) / state.qdd_variance.mean(axis=0)) == pytest.approx(
+        1.0, abs=0.05
+    )
