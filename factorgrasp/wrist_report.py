@@ -168,13 +168,23 @@ def _range_section(result: WristResult) -> Section:
                 f"{down} {np.degrees(-one.minimum.value):.1f}",
                 f"{one.cycles}",
                 "" if np.isnan(one.cycle_sd) else f"{np.degrees(one.cycle_sd):.1f}",
+                f"{np.degrees(one.largest.value):.1f} {PM}{np.degrees(one.largest.sd):.1f}",
             )
         )
     return Section(
         "Ranges of motion",
         "Mean of the extremes of the cycles, each of them fitted to the smoothed angle.",
         table=Table(
-            ("axis", "range (deg)", "95 % interval", "one way", "other way", "cycles", "sd between cycles"),
+            (
+                "axis",
+                "range (deg)",
+                "95 % interval",
+                "one way",
+                "other way",
+                "cycles",
+                "between cycles",
+                "largest (deg)",
+            ),
             tuple(rows),
         ),
     )

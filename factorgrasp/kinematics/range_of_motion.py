@@ -36,6 +36,9 @@ class RangeOfMotion:
         Mean of the maxima minus mean of the minima (rad). Cycles of less than 90 % of the usual extent count less, of half of it not.
     maximum, minimum : Measure
         Those means (rad).
+    largest : Measure
+        From the lowest to the highest angle of the whole track (rad), both of them fitted as well: what irregular motion has instead of a
+        range of its cycles.
     cycles : int
         Complete cycles that entered; 0 when the angle did not turn back and forth, and the ends of the track count.
     cycle_sd : float
@@ -49,6 +52,7 @@ class RangeOfMotion:
     range: Measure
     maximum: Measure
     minimum: Measure
+    largest: Measure
     cycles: int
     cycle_sd: float
     words: str = ""
@@ -61,6 +65,7 @@ class RangeOfMotion:
             "interval_95": list(self.range.interval),
             self.directions[0]: self.maximum.to_dict(),
             self.directions[1]: self.minimum.to_dict(),
+            "largest": self.largest.to_dict(),
             "cycles": self.cycles,
             "cycle_sd": self.cycle_sd,
             "unit": "rad",
@@ -107,10 +112,11 @@ def range_of_motion(
     tops, bottoms = [k for k in tops if good[k]], [k for k in bottoms if good[k]]
     words = ""
     cycles = min(len(tops), len(bottoms))
+    order = np.flatnonzero(good)
+    highest, lowest = int(order[np.argmax(angle[good])]), int(order[np.argmin(angle[good])])
     if not cycles:
         words = "no full cycle: the largest and the smallest angle of the whole track"
-        order = np.flatnonzero(good)
-        tops, bottoms = [int(order[np.argmax(angle[good])])], [int(order[np.argmin(angle[good])])]
+        tops, bottoms = [highest], [lowest]
     elif len(tops) + len(bottoms) < 3:
         words = "one cycle only"
     level = STRETCH * (high - low)
@@ -119,6 +125,9 @@ def range_of_motion(
     lower = np.stack([_vertex(t, both, angle, good, k, level, -1.0) for k in bottoms], axis=1)
     middle = 0.5 * (np.median(upper[0]) + np.median(lower[0]))
     maximum, minimum = upper @ _weights(upper[0] - middle), lower @ _weights(middle - lower[0])
+    largest = _vertex(t, both, angle, good, highest, level, 1.0) - _vertex(
+        t, both, angle, good, lowest, level, -1.0
+    )
     spans = upper[0, :cycles] - lower[0, :cycles]
     return RangeOfMotion(
         axis,
@@ -126,6 +135,7 @@ def range_of_motion(
         measured(maximum[0] - minimum[0], maximum[1:] - minimum[1:], "rad"),
         measured(maximum[0], maximum[1:], "rad"),
         measured(minimum[0], minimum[1:], "rad"),
+        measured(largest[0], largest[1:], "rad"),
         cycles,
         float(np.std(spans, ddof=1)) if cycles > 1 else float("nan"),
         words,

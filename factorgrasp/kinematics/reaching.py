@@ -2,7 +2,8 @@
 
 The speed of a track that a camera's pixels gave is noisy at high frequencies, where an arm does nothing. So ways and speed profiles are
 those of the motion up to :data:`BANDWIDTH`, and jerk, whose noise grows with the seventh power of frequency, goes up to the second
-harmonic of a movement's duration. A movement begins and ends where its speed crosses a tenth of its peak.
+harmonic of a movement's duration. A movement begins and ends where its speed crosses a tenth of its peak, or where it is least when the
+wrist does not come to rest between two movements.
 """
 
 from __future__ import annotations
@@ -31,6 +32,10 @@ SMALLEST = 0.05
 """Shorter ways (m) are no reaching."""
 
 _SMALLER_PEAKS = 0.3
+_VALLEY = 0.5
+"""A speed that falls below this share of the peak and rises again by half as much parts two movements."""
+_NEAR = 0.2
+"""s: the drawn tracks' movements begin and end that near to the estimated one's."""
 _LARGEST_GAP = 2.5
 _UNITS = {
     "distance": "m",
@@ -129,7 +134,7 @@ def movements(
         # One sample more on each side: the crossing lies between two.
         if first < 1 or last + 2 > clock.size or last - first < 4 or not known[first - 1 : last + 2].all():
             continue
-        made = _movement(clock, p, v, slow, peak, onset, rate, smallest)
+        made = _movement(clock, p, v, slow, (first, peak, last), onset, rate, smallest)
         if made is not None:
             out.append(made)
     return tuple(out)
@@ -148,7 +153,7 @@ def on_clock(clock: FloatArray, t: FloatArray, values: FloatArray) -> FloatArray
 
 
 def _stretches(speed: FloatArray, onset: float) -> list[tuple[int, int, int]]:
-    """First, peak and last index of each stretch in which the speed exceeds `onset` times its largest there."""
+    """First, peak and last index of each movement."""
     out: list[tuple[int, int, int]] = []
     free = speed.copy()
     largest = float(speed.max())
@@ -156,10 +161,24 @@ def _stretches(speed: FloatArray, onset: float) -> list[tuple[int, int, int]]:
         peak = int(np.argmax(free))
         if free[peak] < _SMALLER_PEAKS * largest:
             break
-        first, last = _around(free, peak, onset * free[peak])
+        first = peak - _extent(free[peak::-1], onset)
+        last = peak + _extent(free[peak:], onset)
         free[first : last + 1] = 0.0
         out.append((first, peak, last))
     return sorted(out)
+
+
+def _extent(speed: FloatArray, onset: float) -> int:
+    """Samples from a peak, the first one, to where the speed has fallen to the onset or is about to rise again."""
+    least = 0
+    for k in range(1, speed.size):
+        if speed[k] <= onset * speed[0]:
+            return k - 1
+        if speed[k] < speed[least]:
+            least = k
+        if speed[least] < _VALLEY * speed[0] and speed[k] > speed[least] + 0.5 * _VALLEY * speed[0]:
+            return least
+    return speed.size - 1
 
 
 def _around(values: FloatArray, peak: int, level: float) -> tuple[int, int]:
@@ -171,17 +190,28 @@ def _around(values: FloatArray, peak: int, level: float) -> tuple[int, int]:
     return first, last
 
 
+def _boundary(speed: FloatArray, near: int, level: float, reach: int) -> float:
+    """Where, between samples, a speed crosses a level nearest to an index; where it is least when it does not."""
+    low, high = max(0, near - reach), min(speed.size, near + reach + 1)
+    s = speed[low:high]
+    crossed = np.flatnonzero((s[:-1] <= level) != (s[1:] <= level))
+    if crossed.size:
+        at = low + crossed + (level - s[crossed]) / (s[crossed + 1] - s[crossed])
+        return float(at[np.argmin(np.abs(at - near))])
+    return float(low + np.argmin(s))
+
+
 def _movement(
     clock: FloatArray,
     p: FloatArray,
     v: FloatArray,
     slow: FloatArray,
-    peak: int,
+    where: tuple[int, int, int],
     onset: float,
     rate: float,
     smallest: float,
 ) -> Movement | None:
-    found = [_describe(clock, p[k], slow[k], peak, onset, rate) for k in range(len(p))]
+    found = [_describe(clock, p[k], slow[k], where, onset, rate) for k in range(len(p))]
     own = found[0]
     if own is None or not own["distance"] >= smallest:
         return None
@@ -193,31 +223,31 @@ def _movement(
         name: _debiased(own[name], drawn[name], unit) for name, unit in _UNITS.items() if name != "ldlj"
     }
     ldlj = _ldlj(v, own, drawn, rate, clock)
-    return Movement(own["start"], own["end"], clock[peak] - own["start"], ldlj=ldlj, **measures)
+    return Movement(own["start"], own["end"], clock[where[1]] - own["start"], ldlj=ldlj, **measures)
 
 
 def _describe(
-    clock: FloatArray, p: FloatArray, v: FloatArray, near: int, onset: float, rate: float
+    clock: FloatArray, p: FloatArray, v: FloatArray, where: tuple[int, int, int], onset: float, rate: float
 ) -> dict[str, float] | None:
-    """The measures of one track's movement whose peak is near an index; None when it runs into what is not known."""
+    """The measures of one track's movement near first, peak and last index of the estimated one; None when it is not known there."""
     speed = np.nan_to_num(np.linalg.norm(v, axis=1), nan=0.0)
-    reach = max(1, round(0.15 * rate))
-    low = max(0, near - reach)
-    peak = low + int(np.argmax(speed[low : near + reach + 1]))
+    reach = max(1, round(_NEAR * rate))
+    low = max(0, where[1] - reach)
+    peak = low + int(np.argmax(speed[low : where[1] + reach + 1]))
     top = _vertex(speed, peak)
-    level = onset * top
-    first, last = _around(speed, peak, level)
-    if first < 1 or last + 1 >= speed.size:
-        return None
     # Between samples, so that noise moves the ends a little instead of by whole frames.
-    start = first - (speed[first] - level) / (speed[first] - speed[first - 1])
-    end = last + (speed[last] - level) / (speed[last] - speed[last + 1])
+    start, end = (_boundary(speed, k, onset * top, reach) for k in (where[0], where[2]))
+    first, last = int(np.floor(start)) + 1, int(np.ceil(end)) - 1
+    if last - first < 3:
+        return None
     at = np.concatenate([[start], np.arange(first, last + 1), [end]])
     index = np.arange(speed.size)
     way = np.stack([np.interp(at, index, column) for column in p.T], axis=1)
     even = np.linspace(start, end, max(8, last - first + 2))
     profile = np.interp(even, index, speed)
     distance = float(np.linalg.norm(way[-1] - way[0]))
+    if not np.isfinite(distance):
+        return None
     length = float(np.sum(np.linalg.norm(np.diff(way, axis=0), axis=1)))
     sampled = (even.size - 1) / (end - start) * rate
     return {

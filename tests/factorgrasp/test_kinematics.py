@@ -231,6 +231,7 @@ def test_range_of_motion_of_the_papers_abduction() -> None:
     assert deviation.axis == "radial_ulnar_deviation"
     assert deviation.cycles >= 3
     assert np.rad2deg(deviation.range.value) == pytest.approx(50.0, abs=1.0)
+    assert np.rad2deg(deviation.largest.value) == pytest.approx(50.0, abs=2.0)
     assert np.rad2deg(deviation.maximum.value) == pytest.approx(25.0, abs=1.0)
     mirrored = wrist_measures(track, "left").range_of_motion[1]
     assert mirrored.maximum.value == pytest.approx(-deviation.minimum.value)
@@ -274,6 +275,27 @@ def _without(track: WristTrack, hidden: BoolArray) -> WristTrack:
         velocity_covariance=holed(track.velocity_covariance, np.inf),
         lost=hidden,
     )
+
+
+def test_movements_without_rest_between_them() -> None:
+    """There and back without a halt, on a way that is not straight: two movements, parted where the speed is least."""
+    t = np.arange(90) / RATE
+    turn = np.clip((t - 0.5) / 2.0, 0.0, 1.0)
+    s = turn**3 * (10.0 + turn * (6.0 * turn - 15.0))
+    angle, rate = np.pi * s, np.gradient(np.pi * s, t)
+    # Half an ellipse that is long and narrow.
+    p = np.stack([0.25 * np.sin(angle), 0.04 * np.cos(angle), 0.0 * t], axis=1)
+    v = np.stack([0.25 * np.cos(angle) * rate, -0.04 * np.sin(angle) * rate, 0.0 * t], axis=1)
+    rng = np.random.default_rng(1)
+    drawn = v + 0.005 * rng.standard_normal((50, *v.shape))
+    found = movements(t, p, v, np.tile(p, (50, 1, 1)), drawn)
+    assert len(found) == 2
+    assert found[0].end == pytest.approx(1.5, abs=0.1)
+    assert found[1].start == pytest.approx(1.5, abs=0.1)
+    for one in found:
+        assert one.distance.value == pytest.approx(0.25, abs=0.02)
+        assert one.distance.sd < 0.01
+        assert 0.9 < one.straightness.value <= 1.01
 
 
 def test_gaps_are_left_out() -> None:
