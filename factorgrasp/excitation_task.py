@@ -138,7 +138,7 @@ def _words(problem: Excitation, result: ExchangeResult) -> str:
     limits = [word for word in result.binding if not word.startswith("excitation between")]
     if result.status is not Status.INFEASIBLE:
         return f"{result.message}; near its end bind: " + ("; ".join(limits[:4]) or "no limit")
-    words = f"{asked} cannot be had within the limits: about {result.share:.2g} of it can"
+    words = f"{asked} cannot be had within the limits: about {max(result.share, result.check.share):.2g} of it can"
     blind = _blind(problem, result)
     if limits:
         words += "; what binds: " + "; ".join(limits[:5])
