@@ -62,13 +62,19 @@ def robots() -> Iterator[Metric]:
         worst = max(worst, float(np.max(np.abs(found - right)) / (1.0 + np.max(np.abs(right)))))
         count += 1
     yield Metric("robot/urdf", count, "", "none", None, "read by pinocchio, with a joint")
-    yield Metric("robot/torque_difference", worst, "", "lower", 1e-10, "largest, relative, on a random state of each")
+    yield Metric(
+        "robot/torque_difference", worst, "", "lower", 1e-10, "largest, relative, on a random state of each"
+    )
 
 
 def task(wrist: HumanWrist | None = None, **settings: Any) -> Excitation:
     """A resting wrist without a robot."""
-    made = ExcitationSettings(**({"alpha": 10.0, "window": 5.0, "duration": 10.0, "bandwidth": 1.0} | settings))
-    return Excitation(GraspBelief(translation=LEVER), static_human(made.duration, np.zeros(3), np.eye(3)), made, wrist)
+    made = ExcitationSettings(
+        **({"alpha": 10.0, "window": 5.0, "duration": 10.0, "bandwidth": 1.0} | settings)
+    )
+    return Excitation(
+        GraspBelief(translation=LEVER), static_human(made.duration, np.zeros(3), np.eye(3)), made, wrist
+    )
 
 
 def coning() -> Iterator[Metric]:
@@ -76,9 +82,23 @@ def coning() -> Iterator[Metric]:
     for bandwidth in (0.5, 1.0, 2.0):
         plan = plan_excitation(task(rest=False, centred=False, bandwidth=bandwidth, alpha=10.0 * bandwidth))
         ratio = plan.coning_ratio if plan.status.ok and plan.share >= 1.0 else np.nan
-        yield Metric(f"coning/steady_{bandwidth:g}_hz", ratio, "", "lower", 1.001, "mean square of the turn over coning's")
+        yield Metric(
+            f"coning/steady_{bandwidth:g}_hz",
+            ratio,
+            "",
+            "lower",
+            1.001,
+            "mean square of the turn over coning's",
+        )
     rest = plan_excitation(task(centred=False))
-    yield Metric("coning/rest_to_rest", rest.coning_ratio, "", "none", None, "two windows of 5 s, at rest at 0 and 10 s")
+    yield Metric(
+        "coning/rest_to_rest",
+        rest.coning_ratio,
+        "",
+        "none",
+        None,
+        "two windows of 5 s, at rest at 0 and 10 s",
+    )
 
 
 def starts(count: int) -> Iterator[Metric]:
@@ -90,7 +110,14 @@ def starts(count: int) -> Iterator[Metric]:
         seconds.append(time.perf_counter() - began)
         processor.append(time.process_time() - used)
         objectives.append(plan.objective if plan.status.ok else np.nan)
-    yield Metric("starts/spread", float(np.ptp(objectives) / np.min(objectives)), "", "lower", 0.01, f"{count} random starts")
+    yield Metric(
+        "starts/spread",
+        float(np.ptp(objectives) / np.min(objectives)),
+        "",
+        "lower",
+        0.01,
+        f"{count} random starts",
+    )
     yield Metric("starts/seconds", float(np.median(seconds)), "s", "lower", 3.0, "median, wall clock")
     yield Metric("starts/processor_seconds", float(np.median(processor)), "s", "none", None, "median")
 
@@ -109,7 +136,11 @@ def panda(tight: bool) -> ExcitationPlan:
     R, p = tool_pose(model, "panda_hand", START)
     settings = ExcitationSettings(alpha=10.0, window=5.0, duration=10.0, bandwidth=1.0)
     arm = ArmTask(robot, "panda_hand", limits, START, None, spheres, pairs[:40])
-    return plan_excitation(Excitation(grasp, static_human(10.0, p + R @ LEVER, R), settings, HumanWrist(max_rotation=0.15), arm=arm))
+    return plan_excitation(
+        Excitation(
+            grasp, static_human(10.0, p + R @ LEVER, R), settings, HumanWrist(max_rotation=0.15), arm=arm
+        )
+    )
 
 
 def joints(quick: bool) -> Iterator[Metric]:
@@ -119,12 +150,38 @@ def joints(quick: bool) -> Iterator[Metric]:
         plan = panda(tight)
         seconds, processor = time.perf_counter() - began, time.process_time() - used
         least = min(plan.check.margins, key=lambda one: one.relative)
-        yield Metric(f"{name}/seconds", seconds, "s", "lower", 30.0, "task space, inverse kinematics and joint space, wall clock")
+        yield Metric(
+            f"{name}/seconds",
+            seconds,
+            "s",
+            "lower",
+            30.0,
+            "task space, inverse kinematics and joint space, wall clock",
+        )
         yield Metric(f"{name}/processor_seconds", processor, "s")
         yield Metric(f"{name}/solved", float(plan.status.ok), "", "higher", 1.0, plan.message)
-        yield Metric(f"{name}/least_margin", least.relative, "", "higher", -1e-6, f"of {len(plan.check.margins)} limits at 1 ms: {least.name}")
-        yield Metric(f"{name}/least_window", plan.share, "", "higher", 1.0, f"of {plan.check.window_start.size} windows, over alpha")
-        yield Metric(f"{name}/force_rms", float(np.sqrt(np.mean(plan.force_rms**2))), "N", note="with 5 cm of uncertainty")
+        yield Metric(
+            f"{name}/least_margin",
+            least.relative,
+            "",
+            "higher",
+            -1e-6,
+            f"of {len(plan.check.margins)} limits at 1 ms: {least.name}",
+        )
+        yield Metric(
+            f"{name}/least_window",
+            plan.share,
+            "",
+            "higher",
+            1.0,
+            f"of {plan.check.window_start.size} windows, over alpha",
+        )
+        yield Metric(
+            f"{name}/force_rms",
+            float(np.sqrt(np.mean(plan.force_rms**2))),
+            "N",
+            note="with 5 cm of uncertainty",
+        )
 
 
 def reference(duration: float, problem: Excitation) -> tuple[np.ndarray, float, float]:
@@ -137,13 +194,19 @@ def reference(duration: float, problem: Excitation) -> tuple[np.ndarray, float, 
     read = np.zeros((t.size, 28))
     read[:, 12:15], read[:, 15:18] = size * np.sin(t)[:, None] * axis, size * np.cos(t)[:, None] * axis
     read[:, 18:21] = np.einsum("nji,j->ni", R, -GRAVITY)
-    return information_of(read, t, problem.sensor_noise, problem.grasp.information_r), float(np.sqrt(np.mean(angle**2))), float(np.max(angle))
+    return (
+        information_of(read, t, problem.sensor_noise, problem.grasp.information_r),
+        float(np.sqrt(np.mean(angle**2))),
+        float(np.max(angle)),
+    )
 
 
 def paper() -> Iterator[Metric]:
     """Same bandwidth and peak speed: what is known of the worst direction; same knowledge: what the wrist feels."""
     duration, bandwidth, peak = 8.0 * np.pi, 1.0 / (2.0 * np.pi), float(np.linalg.norm(PRINTED_RATE))
-    belief = GraspBelief(translation=np.array([1.11, 0.16, 0.08]), covariance=np.diag([0.5**2] * 3 + [0.6**2] * 3))
+    belief = GraspBelief(
+        translation=np.array([1.11, 0.16, 0.08]), covariance=np.diag([0.5**2] * 3 + [0.6**2] * 3)
+    )
     human, wrist = static_human(duration, np.zeros(3), np.eye(3)), HumanWrist(max_rotation=1.6)
     shared = {"duration": duration, "bandwidth": bandwidth, "max_angular_velocity": peak, "step": 5e-3}
 
@@ -153,27 +216,60 @@ def paper() -> Iterator[Metric]:
     information, rms, most = reference(duration, made(alpha=1.0))
     spread = np.linalg.eigvalsh(np.linalg.inv(information)[3:, 3:])
     worst, seen = float(np.sqrt(spread[-1])), float(np.sqrt(spread[-2]))
-    yield Metric("paper/reference_worst_sd", 1000.0 * worst, "mm", note="lever arm along the one axis; 600 mm was known before")
+    yield Metric(
+        "paper/reference_worst_sd",
+        1000.0 * worst,
+        "mm",
+        note="lever arm along the one axis; 600 mm was known before",
+    )
     yield Metric("paper/reference_seen_sd", 1000.0 * seen, "mm", note="the directions across the axis")
     fast = plan_excitation(made(alpha=1e3))
     planned = float(np.sqrt(np.linalg.eigvalsh(fast.predicted_covariance[3:, 3:])[-1]))
     speed = float(np.max(np.linalg.norm(fast.angular_velocity, axis=1)))
-    yield Metric("paper/planned_worst_sd", 1000.0 * planned, "mm", note=f"peak speed {speed:.3f} of {peak:.3f} rad/s; {fast.share * 1e3:.3g} rad^2/s^3")
-    yield Metric("paper/worst_sd_ratio", worst / planned, "", "higher", 10.0, "same bandwidth, peak speed and duration")
+    yield Metric(
+        "paper/planned_worst_sd",
+        1000.0 * planned,
+        "mm",
+        note=f"peak speed {speed:.3f} of {peak:.3f} rad/s; {fast.share * 1e3:.3g} rad^2/s^3",
+    )
+    yield Metric(
+        "paper/worst_sd_ratio", worst / planned, "", "higher", 10.0, "same bandwidth, peak speed and duration"
+    )
     equal = plan_excitation(made(translation_sd=seen))
     turn = np.linalg.norm(equal.turn, axis=1)
     found = float(np.sqrt(np.linalg.eigvalsh(equal.predicted_covariance[3:, 3:])[-1]))
-    yield Metric("paper/equal_worst_sd", 1000.0 * found, "mm", note="planned to know every direction as the reference knows two")
-    yield Metric("paper/moment_rms_ratio", rms / float(np.sqrt(np.mean(turn**2))), "", "higher", 1.0, "reference over planned, at that knowledge")
-    yield Metric("paper/moment_peak_ratio", most / float(np.max(turn)), "", "none", None, "reference over planned")
+    yield Metric(
+        "paper/equal_worst_sd",
+        1000.0 * found,
+        "mm",
+        note="planned to know every direction as the reference knows two",
+    )
+    yield Metric(
+        "paper/moment_rms_ratio",
+        rms / float(np.sqrt(np.mean(turn**2))),
+        "",
+        "higher",
+        1.0,
+        "reference over planned, at that knowledge",
+    )
+    yield Metric(
+        "paper/moment_peak_ratio", most / float(np.max(turn)), "", "none", None, "reference over planned"
+    )
 
 
 def solvers() -> Iterator[Metric]:
     """One program, several solvers."""
-    rows = compare({"plan": ExcitationTask(task(duration=5.0))}, ["ipopt", "fatrop", "sqpmethod"], repeat=1).rows
+    rows = compare(
+        {"plan": ExcitationTask(task(duration=5.0))}, ["ipopt", "fatrop", "sqpmethod"], repeat=1
+    ).rows
     best = min(row.objective for row in rows if row.correct and row.objective is not None)
     for row in rows:
-        yield Metric(f"solver/{row.solver}", (row.solve or np.nan) * 1e3, "ms", note=f"{row.status}, {row.iterations} iterations, above best {((row.objective or np.nan) - best) / best:.0e}")
+        yield Metric(
+            f"solver/{row.solver}",
+            (row.solve or np.nan) * 1e3,
+            "ms",
+            note=f"{row.status}, {row.iterations} iterations, above best {((row.objective or np.nan) - best) / best:.0e}",
+        )
     agreeing = sum(bool(row.correct) and row.status == "solved" for row in rows)
     yield Metric("solver/agreeing", agreeing, "", "higher", 2.0, "solved, and right by our own check")
 
@@ -195,16 +291,27 @@ def main() -> int:
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results"))
     chosen = parser.parse_args()
-    parts = [robots(), coning(), starts(chosen.starts if not chosen.quick else 3), joints(chosen.quick), paper(), solvers(), refusals()]
+    parts = [
+        robots(),
+        coning(),
+        starts(chosen.starts if not chosen.quick else 3),
+        joints(chosen.quick),
+        paper(),
+        solvers(),
+        refusals(),
+    ]
     metrics: list[Metric] = []
     for part in parts:
         for metric in part:
             metrics.append(metric)
-            print(f"{metric.key}: {metric.value:.6g} {metric.unit} {'' if metric.passed is None else 'met' if metric.passed else 'MISSED'} ({metric.note})", flush=True)
+            print(
+                f"{metric.key}: {metric.value:.6g} {metric.unit} {metric.verdict} ({metric.note})",
+                flush=True,
+            )
     table = metric_table(metrics, "Planned excitations")
     conditions = environment(["factorgrasp", "casadi", "pin", "numpy"])
     write_text(chosen.out / "excitation_benchmark.md", table.markdown() + "\n")
-    record = {"conditions": conditions, "metrics": [{"key": m.key, "value": m.value, "unit": m.unit, "met": m.passed, "note": m.note} for m in metrics]}
+    record = {"conditions": conditions, "metrics": [m.to_dict() for m in metrics]}
     write_text(chosen.out / "excitation_benchmark.json", json.dumps(record, indent=1) + "\n")
     return 1 if missed(metrics) else 0
 

@@ -138,7 +138,7 @@ def _words(problem: Excitation, result: ExchangeResult) -> str:
     limits = [word for word in result.binding if not word.startswith("excitation between")]
     if result.status is not Status.INFEASIBLE:
         return f"{result.message}; near its end bind: " + ("; ".join(limits[:4]) or "no limit")
-    words = f"{asked} cannot be had within the limits: about {result.share:.2g} of it can"
+    words = f"{asked} cannot be had within the limits: about {max(result.share, result.check.share):.2g} of it can"
     blind = _blind(problem, result)
     if limits:
         words += "; what binds: " + "; ".join(limits[:5])
@@ -181,7 +181,7 @@ def _outside(problem: Excitation) -> str:
         return f"with this grasp the end-effector begins at {place}, outside the workspace box along {', '.join(axes)}"
     from factorgrasp.problems.excitation_arm import tool_pose
 
-    found_R, found_p = tool_pose(arm.robot.model, arm.frame, arm.start)
+    _found_R, found_p = tool_pose(arm.robot.model, arm.frame, arm.start)
     miss = float(np.linalg.norm(found_p - p))
     if miss > MISSED:
         q, left = arm.start, miss
@@ -191,8 +191,8 @@ def _outside(problem: Excitation) -> str:
             < 0.03 * (arm.limits.position_upper[j] - arm.limits.position_lower[j])
         ]  # fmt: skip
         return (
-            f"the grasp is outside the robot's workspace: the end-effector would have to begin at {place}, {np.linalg.norm(p):.2f} m from the "
-            f"base, and comes no nearer than {left:.3f} m"
+            f"the grasp is outside the robot's workspace: the end-effector would have to begin at {place}, {np.linalg.norm(p):.2f} m from "
+            f"the base, and comes no nearer than {left:.3f} m"
             + (f"; joints at their limits: {', '.join(at)}" if at else "")
         )
     return ""
@@ -219,7 +219,7 @@ def _inverse_kinematics(problem: Excitation, C: FloatArray) -> tuple[FloatArray,
     ]  # fmt: skip
     words = (
         f"the motion leaves the robot's workspace: at {t[k]:.2f} s the end-effector would have to be at "
-        f"({', '.join(f'{x:.3f}' for x in p[k])}) m, {np.linalg.norm(p[k]):.2f} m from the base, and misses it by {errors[k]:.3g} (m and rad)"
+        f"({', '.join(f'{x:.3f}' for x in p[k])}) m, {np.linalg.norm(p[k]):.2f} m from the base, and misses it by {errors[k]:.3g} (m, rad)"
     )
     return (
         t,

@@ -252,7 +252,7 @@ class Excitation:
         )  # fmt: skip
 
     def start(self, seed: int | None = None) -> FloatArray:
-        """Coefficients to start from in task space: turning about all axes at the highest frequencies, or at random; as strong as asked for."""
+        """Coefficients to start from, as strong as asked for: turning about all axes at the highest frequencies, or at random."""
         space, nb = self.task, self.basis.size
         m = space.motion.coordinates
         if seed is None:
@@ -283,7 +283,7 @@ class Excitation:
                 low = middle
             else:
                 high = middle
-        return base + max(high, 0.02) * C
+        return np.asarray(base + max(high, 0.02) * C)
 
     @cached_property
     def energy_scale(self) -> float:
@@ -340,7 +340,7 @@ class Excitation:
                 path |= {(index, float(t[k])) for k in worst}
         starts, shares = self._grid_windows(space, z, given)
         windows, tighter = set(points.windows), points.tighter
-        if np.min(shares) < needed:
+        if 0.0 < needed and np.min(shares) < needed:
             worst_start = float(starts[int(np.argmin(shares))])
             near = {
                 int(np.clip(k, 0, self._panels - self._window_panels))
@@ -368,7 +368,7 @@ class Excitation:
             symbol, float(self.grid[b] - self.grid[a]), 1.0, self.settings.centred
         )
         values = NodeFunction("G", symbol, ca.SX.sym("p", 0), made).values(s, np.empty((0, 1)))[0]
-        return _full(values[None])[0]
+        return np.asarray(_full(values[None])[0])
 
     def predicted_information(self, space: PlanSpace, C: FloatArray) -> FloatArray:
         """(6, 6) about [turn about the axes of r, lever arm] after the whole motion, what was known before included."""
@@ -388,7 +388,7 @@ class Excitation:
 
     @property
     def _window_panels(self) -> int:
-        return min(int(round(self.settings.window_length / self.panel)), self._panels)
+        return min(round(self.settings.window_length / self.panel), self._panels)
 
     def _panel_length(self) -> tuple[float, int]:
         """Panels of which a window and the duration hold whole numbers, as far as that can be."""
@@ -400,7 +400,7 @@ class Excitation:
         ):
             panel = s.window_length / count
             if abs(s.duration / panel - round(s.duration / panel)) < 1e-6:
-                return panel, int(round(s.duration / panel))
+                return panel, round(s.duration / panel)
         count = int(np.ceil(least * s.duration))
         return s.duration / count, count
 
@@ -441,7 +441,7 @@ class Excitation:
         self, space: PlanSpace, z: FloatArray, given: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         total = _cumulative(self.grid, space.integrand.values(z, given))
-        length = int(round(self.settings.window_length / (self.grid[1] - self.grid[0])))
+        length = round(self.settings.window_length / (self.grid[1] - self.grid[0]))
         inside = (total[length:] - total[: total.shape[0] - length]).T
         values = self._grid_condition.values(inside, np.empty((0, inside.shape[1])))
         shares = (
@@ -449,7 +449,7 @@ class Excitation:
             if self.settings.alpha is not None
             else np.min(values, axis=1)
         )
-        return self.grid[: inside.shape[1]], shares
+        return self.grid[: inside.shape[1]], np.asarray(shares, dtype=np.float64)
 
     @cached_property
     def _grid_condition(self) -> NodeFunction:

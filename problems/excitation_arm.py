@@ -202,8 +202,8 @@ def link_spheres(
 ) -> tuple[tuple[tuple[int, FloatArray, float], ...], tuple[tuple[int, int, str], ...]]:
     """Spheres that cover the collision geometry of the URDF, and the pairs of them whose distance is worth watching.
 
-    Cylinders, capsules and boxes are covered by spheres along their longest axis. Pairs on one link or on neighbouring links are left out, and
-    pairs that are nearer than asked for at the start: there the geometry is too coarse to say anything.
+    Cylinders, capsules and boxes are covered by spheres along their longest axis. Pairs on one link or on neighbouring links are left
+    out, and pairs that are nearer than asked for at the start: there the geometry is too coarse to say anything.
 
     Raises
     ------

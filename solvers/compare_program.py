@@ -55,12 +55,30 @@ class ProgramCase(Case):
         found, timing, _ = measure(fresh, min(repeat, MOST_REPEATS))
         best = last[0]
         if not np.all(np.isfinite(best.x)):
-            return Outcome(found.status, np.nan, None, None, timing, found.iterations, found.message, found, estimation=False)
+            return Outcome(
+                found.status,
+                np.nan,
+                None,
+                None,
+                timing,
+                found.iterations,
+                found.message,
+                found,
+                estimation=False,
+            )
         check = check_program(self.stated, best)
         certificate = Certificate(check.primal, check.dual, check.complementarity)
         # Scaled so that the comparison's tolerance is where an answer counts as right.
         part = options.tolerance / RIGHT
         judged = Certificate(check.primal * part, check.dual * part, check.complementarity * part)
         return Outcome(
-            found.status, check.objective, certificate, judged, timing, found.iterations, found.message, found, estimation=False
+            found.status,
+            check.objective,
+            certificate,
+            judged,
+            timing,
+            found.iterations,
+            found.message,
+            found,
+            estimation=False,
         )

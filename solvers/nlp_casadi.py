@@ -54,7 +54,12 @@ class CasadiNlp(NlpSolver):
 
         began = time.perf_counter()
         oracle = _Oracle(program, self.convex)
-        options = {"print_time": False, "error_on_fail": False, "show_eval_warnings": False, **self.plugin_options(warm_start is not None)}
+        options = {
+            "print_time": False,
+            "error_on_fail": False,
+            "show_eval_warnings": False,
+            **self.plugin_options(warm_start is not None),
+        }
         with _silence():
             solver = casadi.nlpsol("nlp", self.plugin, oracle.function, options)
         inputs: dict[str, Any] = {
@@ -105,7 +110,7 @@ class Ipopt(CasadiNlp):
             "print_level": 0,
             "sb": "yes",
             "tol": self.options.tolerance,
-            "max_iter": self.options.max_iterations or 300,
+            "max_iter": self.options.max_iterations or 200,
             "mu_strategy": "adaptive",
         }
         if warm:

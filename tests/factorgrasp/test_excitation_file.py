@@ -48,12 +48,20 @@ def run(*arguments: str) -> Any:
 @needs_panda
 def test_panda_under_all_limits(tmp_path: Path) -> None:
     """Velocity limits that bind; every limit recomputed from the trajectory file, dynamics by pinocchio itself."""
-    file = written(tmp_path, SMALL + robot("velocity = 0.45\ncollision_distance = 0.01\nbox_lower = [0.1, -0.6, 0.1]\nbox_upper = [0.9, 0.6, 1.0]\n"))
+    file = written(
+        tmp_path,
+        SMALL
+        + robot(
+            "velocity = 0.45\ncollision_distance = 0.01\nbox_lower = [0.1, -0.6, 0.1]\nbox_upper = [0.9, 0.6, 1.0]\n"
+        ),
+    )
     done = run("solve", str(file), "--out", str(tmp_path / "out"))
     assert done.exit_code == 0, done.output
     columns = (tmp_path / "out" / "trajectory.csv").read_text().splitlines()[0].split(",")
     data = np.loadtxt(tmp_path / "out" / "trajectory.csv", delimiter=",", skiprows=1)
-    q, qd, qdd, tau = (data[:, [columns.index(f"{name}{j}") for j in range(1, 8)]] for name in ("q", "qd", "qdd", "tau"))
+    q, qd, qdd, tau = (
+        data[:, [columns.index(f"{name}{j}") for j in range(1, 8)]] for name in ("q", "qd", "qdd", "tau")
+    )
     step = data[1, 0] - data[0, 0]
     assert np.max(np.abs(qd)) <= 0.45 * (1 + 1e-6)
     assert np.max(np.abs(qd)) > 0.4
@@ -67,14 +75,24 @@ def test_panda_under_all_limits(tmp_path: Path) -> None:
     for k in range(0, q.shape[0], 150):
         np.testing.assert_allclose(pin.rnea(model, body, q[k], qd[k], qdd[k]), tau[k], atol=1e-6)
         pin.forwardKinematics(model, body, q[k])
-        np.testing.assert_allclose(pin.updateFramePlacement(model, body, frame).translation, data[k, [columns.index(c) for c in ("px", "py", "pz")]], atol=1e-8)  # fmt: skip
+        place = pin.updateFramePlacement(model, body, frame).translation
+        np.testing.assert_allclose(place, data[k, [columns.index(c) for c in ("px", "py", "pz")]], atol=1e-8)
     assert np.all(np.abs(tau) <= model.effortLimit)
     np.testing.assert_allclose(qd[[0, -1]], 0.0, atol=1e-8)
     found = json.loads((tmp_path / "out" / "estimate.json").read_text())
     assert found["status"] == "solved"
     assert found["excitation"]["lambda_min"] >= 5.0
     names = " ".join(one["limit"] for one in found["margins"])
-    for word in ("position of", "velocity of", "acceleration of", "jerk of", "torque of", "distance between", "workspace box", "rotation of"):
+    for word in (
+        "position of",
+        "velocity of",
+        "acceleration of",
+        "jerk of",
+        "torque of",
+        "distance between",
+        "workspace box",
+        "rotation of",
+    ):
         assert word in names
     assert min(one["relative"] for one in found["margins"]) > -1e-6
     page = (tmp_path / "out" / "report.html").read_text()
@@ -83,7 +101,9 @@ def test_panda_under_all_limits(tmp_path: Path) -> None:
 
 @needs_panda
 def test_what_is_out_of_reach_is_said(tmp_path: Path) -> None:
-    far = written(tmp_path, SMALL.replace("[excitation]", '[human]\nposition = [1.9, 0.0, 0.4]\n[excitation]') + robot())
+    far = written(
+        tmp_path, SMALL.replace("[excitation]", "[human]\nposition = [1.9, 0.0, 0.4]\n[excitation]") + robot()
+    )
     done = run("solve", str(far), "--out", str(tmp_path / "far"))
     assert done.exit_code == 1
     assert "outside the robot's workspace" in done.output
@@ -95,9 +115,18 @@ def test_what_is_out_of_reach_is_said(tmp_path: Path) -> None:
 
 
 def test_solvers_are_compared(tmp_path: Path) -> None:
-    done = run("compare", str(written(tmp_path, SMALL)), "--solvers", "ipopt,fatrop,cholesky", "--out", str(tmp_path / "out"))
+    done = run(
+        "compare",
+        str(written(tmp_path, SMALL)),
+        "--solvers",
+        "ipopt,fatrop,cholesky",
+        "--out",
+        str(tmp_path / "out"),
+    )
     assert done.exit_code == 0, done.output
-    rows = {row["solver"]: row for row in json.loads((tmp_path / "out" / "comparison.json").read_text())["rows"]}
+    rows = {
+        row["solver"]: row for row in json.loads((tmp_path / "out" / "comparison.json").read_text())["rows"]
+    }
     assert rows["ipopt"]["correct"] is True
     assert rows["fatrop"]["correct"] is True
     assert rows["fatrop"]["objective"] == pytest.approx(rows["ipopt"]["objective"], rel=1e-5)
@@ -113,9 +142,15 @@ def test_solver_may_be_a_table_or_a_name(tmp_path: Path) -> None:
 
 
 def test_grasp_comes_from_an_estimate(tmp_path: Path) -> None:
-    grasp = {"rotation_wxyz": [0.0, 0.0, 0.0, 1.0], "translation": [0.1, 0.2, 0.3], "covariance": np.eye(6).tolist()}
+    grasp = {
+        "rotation_wxyz": [0.0, 0.0, 0.0, 1.0],
+        "translation": [0.1, 0.2, 0.3],
+        "covariance": np.eye(6).tolist(),
+    }
     (tmp_path / "estimate.json").write_text(json.dumps({"values": {"grasp": grasp}}))
-    belief = load_problem(written(tmp_path, SMALL.replace(GRASP, '[grasp]\nestimate = "estimate.json"\n'))).problem.problem.grasp
+    belief = load_problem(
+        written(tmp_path, SMALL.replace(GRASP, '[grasp]\nestimate = "estimate.json"\n'))
+    ).problem.problem.grasp
     np.testing.assert_allclose(belief.rotation, np.diag([-1.0, -1.0, 1.0]), atol=1e-12)
     np.testing.assert_allclose(belief.translation, [0.1, 0.2, 0.3])
 
@@ -164,7 +199,11 @@ def test_bad_robots_are_named(tmp_path: Path, extra: str, words: str) -> None:
 
 @needs_panda
 def test_the_example_loads(tmp_path: Path) -> None:
-    text = (ROOT / "examples" / "excitation.toml").read_text(encoding="utf-8").replace('"panda.urdf"', f'"{PANDA}"')
+    text = (
+        (ROOT / "examples" / "excitation.toml")
+        .read_text(encoding="utf-8")
+        .replace('"panda.urdf"', f'"{PANDA}"')
+    )
     stated = load_problem(written(tmp_path, text))
     assert stated.title == "Panda, resting wrist"
     assert stated.problem.problem.arm is not None

@@ -105,7 +105,9 @@ def test_an_error_of_the_program_comes_through() -> None:
 
 
 def test_programs_are_compared_by_those_that_take_them() -> None:
-    rows = {row.solver: row for row in compare([Rosenbrock()], ["ipopt", "sqpmethod", "cholesky"], repeat=1).rows}
+    rows = {
+        row.solver: row for row in compare([Rosenbrock()], ["ipopt", "sqpmethod", "cholesky"], repeat=1).rows
+    }
     assert rows["ipopt"].correct is True
     assert rows["sqpmethod"].correct is True
     assert rows["sqpmethod"].objective == pytest.approx(rows["ipopt"].objective, rel=1e-6)
