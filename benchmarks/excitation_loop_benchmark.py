@@ -21,9 +21,11 @@ import argparse
 import json
 import os
 import sys
+import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -35,6 +37,7 @@ from factorgrasp.excitation_prediction import predict_grasp
 from factorgrasp.models.arm import Arm, panda_arm, panda_urdf
 from factorgrasp.models.robot import load_robot
 from factorgrasp.pose_reference import Blend, about_point, times
+from factorgrasp.problem_file import load_problem
 from factorgrasp.problems import GraspPose
 from factorgrasp.problems.grasp_kinematics import robot_kinematics
 from factorgrasp.problems.grasp_settings import GraspNoise
@@ -179,6 +182,7 @@ def panda_log(data: Path) -> list[Metric]:
     assert log.motion.joints.correlation is not None
     for k, value in enumerate(log.motion.joints.correlation):
         rows.append(Metric(f"Panda log/correlation of predicted and measured torque, joint {k + 1}", value))
+    rows += _casadi(model, log)
     plan, used = about_the_wrist(float(t[-1] - t[0]))
     mine = ExcitationEvaluationTask(plan, translation=LEVER, robot_model=model, frame=FRAME, reference="mean").solve()  # fmt: skip
     rows += _evaluated("about the wrist", mine)
@@ -193,6 +197,100 @@ def panda_log(data: Path) -> list[Metric]:
         Metric("log over ours/RMS force at the wrist", log.wrench_summary.rms_force / mine.wrench_summary.rms_force, "", "higher", 1.0),
         Metric("log over ours/RMS torque at the wrist", log.wrench_summary.rms_torque / mine.wrench_summary.rms_torque, "", "higher", 1.0),
     ]  # fmt: skip
+    return rows
+
+
+PLAN = """\
+kind = "excitation"
+[robot]
+urdf = "{urdf}"
+frame = "{frame}"
+start = [0.0, -0.5, 0.0, -2.55, 0.0, 2.05, 0.785]
+acceleration = {acceleration}
+[grasp]
+translation = {lever}
+[excitation]
+alpha = 40.0
+window = 5.0
+duration = 10.0
+bandwidth = 1.2
+"""
+
+
+def panda_plan(data: Path) -> list[Metric]:
+    """The planner's own motion under the Panda's limits, evaluated like the log."""
+    path, urdf = data / "panda_ident" / "panda_excitation.npz", panda_urdf()
+    if not path.is_file() or urdf is None:
+        return []
+    text = PLAN.format(urdf=urdf, frame=FRAME, acceleration=ACCELERATION.tolist(), lever=LEVER.tolist())
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "plan.toml"
+        file.write_text(text, encoding="utf-8")
+        start = time.process_time()
+        plan = load_problem(file).solve()
+        cost = time.process_time() - start
+        plan.save(folder)
+        file.write_text(text + '[evaluate]\nfile = "trajectory.csv"\nreference = "mean"\n', encoding="utf-8")
+        mine = load_problem(file).solve()
+        file.write_text(
+            text.replace("40.0", "1.0") + f'[evaluate]\nfile = "{path}"\nreference = "mean"\n',
+            encoding="utf-8",
+        )
+        log = load_problem(file).solve()
+    worst = [float(result.windows.lambda_min.min()) for result in (mine, log)]
+    return [
+        Metric("planned/margin to the nearest limit", min(m.relative for m in plan.check.margins), "", "higher", 0.0, "share of its range"),
+        *_evaluated("planned, 10 s", mine),
+        Metric("planned over log/lambda_min of the worst 5 s", worst[0] / worst[1], "", "higher", 1.0),
+        Metric("log over planned/RMS force at the wrist", log.wrench_summary.rms_force / mine.wrench_summary.rms_force, "", "higher", 1.0),
+        Metric("log over planned/RMS torque at the wrist", log.wrench_summary.rms_torque / mine.wrench_summary.rms_torque, "", "higher", 1.0),
+        Metric("planned/CPU", cost, "s"),
+    ]  # fmt: skip
+
+
+def _casadi(model: Any, log: ExcitationEvaluation) -> list[Metric]:
+    """The same torques by the CasADi model."""
+    from factorgrasp.models.casadi_robot import CasadiRobot
+
+    joints = log.motion.joints
+    assert joints is not None
+    assert joints.measured_torque is not None
+    good = np.isfinite(np.hstack([joints.q, joints.qd, joints.qdd, joints.measured_torque])).all(axis=1)
+    # The gripper's fingers stay where they are.
+    full = [
+        np.hstack([part[good], np.zeros((good.sum(), model.nv - 7))])
+        for part in (joints.q, joints.qd, joints.qdd)
+    ]
+    rnea = CasadiRobot(model).rnea_function().map(int(good.sum()))
+    torque = np.array(rnea(*(part.T for part in full)).full()).T[:, :7]
+    rows = [
+        Metric("Panda log/torque of the CasADi model against pinocchio, largest difference",
+               float(np.max(np.abs(torque - joints.torque[good]))), "Nm", "lower", 1e-10),
+    ]  # fmt: skip
+    for k in range(7):
+        value = float(np.corrcoef(torque[:, k], joints.measured_torque[good][:, k])[0, 1])
+        rows.append(Metric(f"Panda log/correlation of CasADi's and measured torque, joint {k + 1}", value))
+    return rows
+
+
+def human_modes(seeds: int) -> list[Metric]:
+    """Human motion in a plane and in all directions, on the arm."""
+    rows = []
+    for mode, words in (
+        ("planar", "circle of 60 mm in 8 s, turns about the direction of travel"),
+        ("full", "the same with turns of 0.12 rad of the human's own"),
+    ):
+        runs = [cehajic2015_loop(seed, duration=SECONDS, human=mode) for seed in range(seeds)]  # type: ignore[arg-type]
+        felt = [run.felt() for run in runs]
+        late = [run.felt(SECONDS - LATE) for run in runs]
+        lever, angle = max(r.translation_error[-1] for r in runs), max(r.rotation_error[-1] for r in runs)
+        rows += [
+            Metric(f"human {mode}/lever arm error, worst seed", 1e3 * lever, "mm", "lower", 5.0, words),
+            Metric(f"human {mode}/orientation error, worst seed", float(np.degrees(angle)), "deg", "lower", 0.2),
+            Metric(f"human {mode}/peak force, worst seed", max(f.peak_force for f in felt), "N"),
+            Metric(f"human {mode}/RMS force of the last {LATE:g} s, worst seed", max(f.rms_force for f in late), "N"),
+            Metric(f"human {mode}/torque limit met", float(sum(r.saturated for r in runs)), "steps"),
+        ]  # fmt: skip
     return rows
 
 
@@ -272,13 +370,17 @@ def main(arguments: list[str] | None = None) -> None:
     default = Path(os.environ.get("FACTORGRASP_DATA", Path(__file__).parents[2] / "shared" / "data"))
     parser.add_argument("--data", type=Path, default=default)
     parser.add_argument("--json", type=Path)
-    parser.add_argument("--only", choices=("loop", "figure", "measure", "log"), help="one part")
+    parser.add_argument(
+        "--only", choices=("loop", "figure", "measure", "log", "plan", "human"), help="one part"
+    )
     chosen = parser.parse_args(arguments)
     parts = {
         "figure": figure_five,
         "measure": lambda: measure(chosen.runs),
         "log": lambda: panda_log(chosen.data),
         "loop": lambda: closed_loop(chosen.seeds),
+        "plan": lambda: panda_plan(chosen.data),
+        "human": lambda: human_modes(max(1, chosen.seeds // 3)),
     }
     rows: list[Metric] = []
     for name, part in parts.items():

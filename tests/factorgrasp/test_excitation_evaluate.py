@@ -141,7 +141,7 @@ def test_demands_that_are_missed_are_said() -> None:
         ('[evaluate]\nfile = "trajectory.csv"\nalhpa = 2.0\n', "Did you mean alpha"),
         ('[evaluate]\nfile = "trajectory.csv"\ncolumns = "joints"\n', "those of joints"),
         ('[evaluate]\nfile = "trajectory.csv"\n[grasp]\nrotation_wxyz = [1.0, 1.0, 0.0, 0.0]\n', "norm 1.41"),
-        ('[evaluate]\nfile = "trajectory.csv"\n[grasp]\ncovariance = [[1.0, 2.0]]\n', "array of 6"),
+        ('[evaluate]\nfile = "trajectory.csv"\n[grasp]\ncovariance = [[1.0, 2.0]]\n', "6, 6"),
         ('[evaluate]\nfile = "trajectory.csv"\n[human]\nstiffnes = 3.0\n', "an unknown one"),
         ('[evaluate]\nfile = "joints.csv"\n', "urdf"),
         ('[evaluate]\nfile = "joints.csv"\n[robot]\nurdf = "arm.urdf"\nframe = "tool"\n', "one of universe"),
