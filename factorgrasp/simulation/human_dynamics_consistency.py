@@ -116,7 +116,8 @@ def errors_of(
     offset : int
         First frame.
     method : {"joint, points known", "joint", "two tasks"}
-        One estimate with the hands' moments known to be none where they hold; the same with moments of 10 Nm about the wrists; or, with those, the
+        One estimate with the hands' moments known to be none where they hold; the same with moments of 10 Nm about
+        the wrists; or, with those, the
         wrenches by momentum first and their posterior into the second task (Tirupachuri 2021).
     """
     motion, keep, own = recording.measured_motion
@@ -237,7 +238,7 @@ def two_tasks_and_joint(
     make: Callable[[int], HumanRecording], seeds: Iterable[int], hands: Sequence[str]
 ) -> dict[str, tuple[float, float, float]]:
     """By method: RMS error of torques and the RMS of their stated sd, Nm, and NEES per degree of freedom of all torques together."""
-    out = {}
+    out: dict[str, tuple[float, float, float]] = {}
     recordings = [make(seed) for seed in seeds]
     methods: tuple[Method, ...] = ("two tasks", "joint", "joint, points known")
     for method in methods:
