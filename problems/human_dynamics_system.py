@@ -7,7 +7,7 @@ per joint the wrench
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,13 +30,19 @@ from factorgrasp.problems.human_dynamics_state import (
     on_balance,
     on_propagation,
 )
-from factorgrasp.problems.human_dynamics_terms import MOTION, DynamicsTerms
+from factorgrasp.problems.human_dynamics_terms import DynamicsTerms
+from factorgrasp.problems.human_dynamics_writers import (
+    Writer,
+    flat,
+    masked,
+    minus_axes,
+    minus_transform,
+    transposed_transform,
+)
 from factorgrasp.problems.link_motion import BodyTree, LinkKinematics
 from factorgrasp.problems.link_motion_spatial import centripetal, velocity_wrench
 from factorgrasp.typing import BoolArray, FloatArray, IntArray
 from factorgrasp.uncertainty import Covariance
-
-Writer = Callable[[LinkKinematics], FloatArray]
 
 
 @dataclass(frozen=True)
@@ -232,8 +238,8 @@ class HumanDynamicsSystem:
                 moving.append((j, dynamics.places(rows, joint_acceleration_of(joint))))
             if self.state_errors:
                 error, above = pose_error_of(joint), f"balance of {tree.links[tree.parents[j]]}"
-                writers.append((dynamics.places(rows, error), _flat(on_propagation(tree, j))))
-                writers.append((dynamics.places(above, error), _flat(on_balance(tree, j))))
+                writers.append((dynamics.places(rows, error), flat(on_propagation(tree, j))))
+                writers.append((dynamics.places(above, error), flat(on_balance(tree, j))))
         for i, link in enumerate(tree.links):
             rows = f"balance of {link}"
             put(rows, wrench_on(link), -np.eye(6))
@@ -244,9 +250,9 @@ class HumanDynamicsSystem:
             up.append((j, dynamics.places(f"balance of {tree.links[tree.parents[j]]}", wrench_of(joint))))
         if moving:
             writers.append(
-                (np.concatenate([at for _, at in moving]), _minus_axes(tree, [j for j, _ in moving]))
+                (np.concatenate([at for _, at in moving]), minus_axes(tree, [j for j, _ in moving]))
             )
-        for pairs, kind in ((through, _minus_transform), (up, _transposed_transform)):
+        for pairs, kind in ((through, minus_transform), (up, transposed_transform)):
             if pairs:
                 writers.append(
                     (np.concatenate([at for _, at in pairs]), kind(np.array([j for j, _ in pairs])))
@@ -262,7 +268,7 @@ class HumanDynamicsSystem:
                 full = rows_of.patterns[variable] if not rows_of.full else np.broadcast_to(
                     rows_of.patterns[variable].any(axis=0), (rows_of.size, size)
                 )  # fmt: skip
-                self._writers.append((soft.places(rows_of.name, variable), _masked(make, full)))
+                self._writers.append((soft.places(rows_of.name, variable), masked(make, full)))
         self._fixed = soft.matrix.data.copy()
         self._fixed_hard = pattern.equalities.matrix.data.copy()
         self._layout(soft, dynamics)
@@ -375,34 +381,3 @@ def _rows(slices: Mapping[str, slice], names: Sequence[str]) -> slice:
     if not names:
         return slice(0, 0)
     return slice(slices[names[0]].start, slices[names[-1]].stop)
-
-
-def _flat(make: Writer) -> Writer:
-    return lambda k: make(k).reshape(k.count, -1)
-
-
-def _minus_axes(tree: BodyTree, joints: Sequence[int]) -> Writer:
-    ends = np.cumsum([len(dofs) for dofs in tree.dofs])
-    chosen = []
-    for j in joints:
-        size = len(tree.dofs[j])
-        column, row = np.tile(np.arange(ends[j] - size, ends[j]), 6), np.repeat(np.arange(6), size)
-        chosen.append(6 * column + row)
-    index = np.concatenate(chosen)
-    return lambda k: np.negative(k.axes.reshape(k.count, -1).take(index, axis=1))
-
-
-def _minus_transform(joints: IntArray) -> Writer:
-    rows, cols = np.nonzero(MOTION)
-    index = (36 * joints[:, None] + 6 * rows + cols).ravel()
-    return lambda k: np.negative(k.transform.reshape(k.count, -1).take(index, axis=1))
-
-
-def _transposed_transform(joints: IntArray) -> Writer:
-    rows, cols = np.nonzero(MOTION.T)
-    index = (36 * joints[:, None] + 6 * cols + rows).ravel()
-    return lambda k: k.transform.reshape(k.count, -1).take(index, axis=1)
-
-
-def _masked(make: Writer, pattern: BoolArray) -> Writer:
-    return lambda k: make(k)[:, pattern]

@@ -27,8 +27,9 @@ from factorgrasp.typing import BoolArray, FloatArray, IntArray
 LANES = 8
 """Frames side by side in the compiled loop; a single frame has a loop of its own."""
 MOST_REFINEMENTS = 6
-TOO_WEAK = 1e11
-"""Trace of the scaled inverse above which the selected inverse has fewer than about five digits; refined solves come in then."""
+TOO_WEAK = 3e12
+"""Trace of the scaled inverse above which the selected inverse may have fewer than four digits (measured: 2e-6 at
+1.2e11); refined solves come in then."""
 MOST_ENTRIES = 400_000
 """Numbers of A that are held at a time, so that they stay in the cache; longer recordings are worked through in pieces."""
 

@@ -39,7 +39,9 @@ def recorded() -> tuple[LinkMotion, list[Sensor]]:
     return motion, [*out, Accelerometer(specific, SPECIFIC**2, link="trunk")]
 
 
-def tuned(motion: LinkMotion, sensors: list[Sensor], rounds: int = 8) -> tuple[list[Sensor], FloatArray, float]:
+def tuned(
+    motion: LinkMotion, sensors: list[Sensor], rounds: int = 8
+) -> tuple[list[Sensor], FloatArray, float]:
     """Solve and propose until it settles: sensors, the stated sd of the last proposal, and the last change."""
     sd, change = np.empty(0), np.inf
     for _ in range(rounds):
@@ -58,7 +60,10 @@ def tuned(motion: LinkMotion, sensors: list[Sensor], rounds: int = 8) -> tuple[l
 def test_mistuned_sensors_come_back(factor: float) -> None:
     """Plates (both) off by that much in their variances: the proposals lie within four of their stated sd of the truth."""
     motion, right = recorded()
-    wrong = [replace(s, covariance=np.asarray(s.covariance) * factor) if isinstance(s, ExternalWrench) else s for s in right]
+    wrong = [
+        replace(s, covariance=np.asarray(s.covariance) * factor) if isinstance(s, ExternalWrench) else s
+        for s in right
+    ]
     before = solve_frames(HumanDynamics(motion, wrong, NOISE))
     ratio = before.innovations[0].ratio
     assert ratio > 1.5 if factor < 1.0 else ratio < 0.7
