@@ -16,12 +16,13 @@ from factorgrasp.human_dynamics_osim import read_osim_motion
 from factorgrasp.models.anthropometry import Sex
 from factorgrasp.models.human import HumanBody, human_body, load_body
 from factorgrasp.models.joint_motion import differentiate_configurations
-from factorgrasp.models.osim import read_osim
+from factorgrasp.models.osim import OsimModel, read_osim
 from factorgrasp.problems.human_dynamics_settings import PerName
 from factorgrasp.problems.link_motion import GRAVITY, LinkMotion
 from factorgrasp.problems.link_motion_files import is_link_archive, load_links, with_masses_of
 from factorgrasp.problems.link_motion_osim import from_osim
 from factorgrasp.problems.link_motion_pinocchio import PinocchioTree
+from factorgrasp.recordings.links import read_link_coordinates
 from factorgrasp.signals import resample_rotations, resample_uniform
 from factorgrasp.toml_tables import check_keys, get, place, sub_table
 from factorgrasp.typing import BoolArray, FloatArray
@@ -135,8 +136,45 @@ def _from_osim(model: Mapping[str, Any], motion: Mapping[str, Any], base_dir: Pa
         found = from_osim(osim, state.t[good], state.q[good], state.qd[good], state.qdd[good], gravity)
         extras = {"q": state.q, "q_sd": np.sqrt(state.q_variance), "q_names": np.array(osim.names)}
         return _known(state.t, good, found, variances, None, extras)
+    if is_link_archive(file):
+        return _osim_archive(osim, motion, file, gravity)
     read = read_osim_motion(osim, motion, file, gravity)
     return _known(read.clock, read.good, read.motion, read.variances)
+
+
+def _osim_archive(osim: OsimModel, motion: Mapping[str, Any], file: Path, gravity: FloatArray) -> BodyMotion:
+    """Coordinates with their derivatives from an archive of link-level arrays: nothing is filtered."""
+    check_keys(motion, ("file", "start", "end", "every", "grf"), "[motion]")
+    table, qd, qdd = read_link_coordinates(file)
+    missing = [
+        c.name
+        for c in osim.coordinates
+        if c.name not in table.names and not c.locked and c.name not in osim.coupled
+    ]
+    if missing:
+        raise InputError(
+            f"{file.name}: names", "the coordinates of the model", ", ".join(missing) + " missing"
+        )
+    every = get(motion, "every", int, "[motion]", 1)
+    if every < 1:
+        raise InputError("[motion] every", "a whole number above 0", str(every))
+    rows = np.flatnonzero(_span(table.t, motion))[::every]
+    parts = []
+    for order, values in enumerate((table.values, qd, qdd)):
+        columns = [
+            values[rows, table.names.index(c.name)]
+            if c.name in table.names
+            else np.full(rows.size, 0.0 if order else c.default)
+            for c in osim.coordinates
+        ]
+        parts.append(np.column_stack(columns))
+    good: BoolArray = np.asarray(np.isfinite(np.concatenate(parts, axis=1)).all(axis=1))
+    if not good.any():
+        raise InputError("[motion]", "at least one frame without gaps", "none")
+    q, v, a = (part[good] for part in parts)
+    clock = table.t[rows]
+    forces = file if get(motion, "grf", bool, "[motion]", True) else None
+    return _known(clock, good, from_osim(osim, clock[good], q, v, a, gravity), forces=forces)
 
 
 def _from_links(model: Mapping[str, Any], motion: Mapping[str, Any], base_dir: Path) -> BodyMotion:
@@ -151,7 +189,7 @@ def _from_links(model: Mapping[str, Any], motion: Mapping[str, Any], base_dir: P
     if not is_link_archive(path):
         raise InputError(
             "[motion] file", "an archive of link-level arrays (.npz), as [model] is one", path.name,
-            "Joint angles and markers need a model with joints: urdf, or height, mass and sex",
+            "Joint angles and markers need a model with joints: urdf, osim, or height with mass and sex",
         )  # fmt: skip
     gravity = get(model, "gravity", Vector, "[model]", _GRAVITY_Y_UP)
     read = load_links(path, gravity, get(model, "ball_joints", tuple[str, ...], "[model]", ()))

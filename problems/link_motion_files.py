@@ -27,7 +27,7 @@ def is_link_archive(path: str | Path) -> bool:
     try:
         with np.load(file, allow_pickle=False) as archive:
             return "bodies" in archive and "R" in archive
-    except (OSError, ValueError, zipfile.BadZipFile):
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile):
         return False
 
 
@@ -65,7 +65,7 @@ def _read(path: str | Path, needed: tuple[str, ...]) -> dict[str, Any]:
             return {name: archive[name] for name in needed}
     except InputError:
         raise
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(str(file), "an archive of link-level arrays (.npz)", str(error)) from error
 
 

@@ -22,7 +22,7 @@ def has_link_forces(path: PathLike) -> bool:
     try:
         with np.load(path, allow_pickle=False) as archive:
             return "grf" in archive and "grf_body" in archive
-    except (ValueError, OSError, zipfile.BadZipFile):
+    except (ValueError, OSError, EOFError, zipfile.BadZipFile):
         return False
 
 
@@ -72,7 +72,7 @@ def _fields(path: PathLike, needed: tuple[str, ...]) -> dict[str, np.ndarray]:
                     str(file), "the fields " + ", ".join(needed), ", ".join(missing) + " missing"
                 )
             return {name: archive[name] for name in needed}
-    except (ValueError, OSError, zipfile.BadZipFile) as error:
+    except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(str(file), "an archive of numpy arrays (.npz)", str(error)) from error

@@ -14,6 +14,7 @@ from factorgrasp.body_state import estimate_state
 from factorgrasp.errors import InputError
 from factorgrasp.models.osim import read_osim
 from factorgrasp.models.osim_functions import simm_spline
+from factorgrasp.problem_file import load_problem
 from factorgrasp.problems.body_observations import BodyObservations, placement_of
 from factorgrasp.problems.link_motion_files import load_links
 from factorgrasp.problems.link_motion_osim import from_osim
@@ -269,3 +270,28 @@ def test_published_generalised_forces_of_walking(dataset: Find, tmp_path: Path) 
                 published.t, found["t"], found["torque"][:, k], np.nan, np.nan
             ) - published.column(column)
             assert np.sqrt(np.nanmean(error**2)) < 1.5, name
+
+
+def test_coordinates_of_an_archive(dataset: Find, tmp_path: Path) -> None:
+    """Model and archive: moments at the joints' centres as from the archive's own poses, and generalised forces beside them."""
+    archive, model = (
+        dataset("opensim_walk_gait2354/links_walk.npz"),
+        dataset("opensim_walk_gait2354/subject01_simbody.osim"),
+    )
+    found = {}
+    for name, more in (("osim", f'[model]\nosim = "{model}"\n'), ("links", "")):
+        (tmp_path / "p.toml").write_text(
+            f'kind = "human_dynamics"\n{more}[motion]\nlinks = "{archive}"\nevery = 10\n[contacts]\nunmeasured = ["pelvis"]\n',
+            encoding="utf-8",
+        )
+        result = load_problem(tmp_path / "p.toml").solve()
+        arrays = result.arrays()
+        order = [
+            arrays["joint_names"].tolist().index(joint) for joint in ("hip_r", "knee_l", "ankle_r", "back")
+        ]
+        found[name] = arrays["joint_moment"][:, order]
+        if name == "osim":
+            assert arrays["torque"].shape == (found[name].shape[0], 17)
+            assert "force on calcn_r" in {one.name for one in result.frames.innovations}
+    # Rows of joints and rows of links weigh the same motion a little differently.
+    assert np.sqrt(np.mean((found["osim"] - found["links"]) ** 2)) < 3.0
