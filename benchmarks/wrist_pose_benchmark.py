@@ -66,11 +66,11 @@ SETTINGS = (
 )
 
 LIMITATIONS = (
-    "Blobs are simulated: 1 px and structured-light depth noise, white; 2 % missed, 5 % of the time covered, 2 clutter blobs a frame, 5 % of "
-    "depths missing, unless a row says otherwise.",
+    "Blobs are simulated: 1 px and structured-light depth noise, white; 2 % missed, 5 % of the time covered, 2 clutter blobs a frame, 5 % "
+    "of depths missing, unless a row says otherwise.",
     "Nominal: the layout is known to 1 mm in space, and where W0 is seen from the camera is given to all estimators, as the paper assumes.",
-    "Own start frame: W0 is estimated from the first frames, once for all estimators, and the layout is known to 1 mm per coordinate. Over a "
-    "reach of 0.28 m one degree of W0 alone is 5 mm.",
+    "Own start frame: W0 is estimated from the first frames, once for all estimators, and the layout is known to 1 mm per coordinate. Over "
+    "a reach of 0.28 m one degree of W0 alone is 5 mm.",
     "A layout measured with 1 mm error per coordinate turns the wrist frame by about a degree: no estimator can see that, and it is in all "
     "errors; the row 'layout exact' shows what is left without it.",
     "A run is lost when more than a tenth of the frames in the light, or half of the last 15, are off by 15 deg or 50 mm.",

@@ -11,7 +11,7 @@ import numpy as np
 from factorgrasp import lie
 from factorgrasp.baselines.cordella2014 import UkfSettings, WristUkf
 from factorgrasp.online.wrist import OnlineWristPose, WristState
-from factorgrasp.problems.wrist_settings import WristAssociation, WristNoise, WristSettings
+from factorgrasp.problems.wrist_settings import LayoutUse, WristAssociation, WristNoise, WristSettings
 from factorgrasp.problems.wrist_track import CameraPose
 from factorgrasp.simulation.wrist import WristRecording, cordella2014
 from factorgrasp.typing import BoolArray, FloatArray
@@ -135,11 +135,23 @@ def run(setting: Setting, seed: int) -> Run:
     return judge(setting, seed, recording, start)
 
 
-def judge(setting: Setting, seed: int, recording: WristRecording, given: CameraPose | None = None) -> Run:
+def judge(
+    setting: Setting,
+    seed: int,
+    recording: WristRecording,
+    given: CameraPose | None = None,
+    layout: LayoutUse = "estimate",
+) -> Run:
     """The streaming estimator and its peers on one recording."""
     association = WristAssociation(method=setting.association)  # type: ignore[arg-type]
     estimator = OnlineWristPose(
-        recording.camera, recording.layout, association, WristNoise(), WristSettings(), given, late=0.3
+        recording.camera,
+        recording.layout,
+        association,
+        WristNoise(),
+        WristSettings(layout=layout),
+        given,
+        late=0.3,
     )
     newest, final, wall, cpu, markers = stream(recording, estimator)
     # A pose is judged where there was something to see; what is said about blackouts is judged apart.

@@ -305,6 +305,11 @@ def _warnings(
         out.append(
             f"depths scatter by {1e3 * depth:.1f} mm where {1e3 * noise.depth_sd:.1f} mm were assumed; set noise.depth_sd"
         )
+    if problem.first_pass.not_rigid:
+        out.append(
+            "the markers do not move as one rigid palm with the measured layout: the layout was not estimated, its covariance was added to "
+            "every residual; check the layout, or give the markers that move on the skin or on fingers a larger sd"
+        )
     if track.ambiguous.any():
         share = 100.0 * float(np.mean(track.ambiguous))
         out.append(

@@ -16,7 +16,8 @@ from factorgrasp.problems.wrist_model import Pairs, predict
 from factorgrasp.problems.wrist_track import CameraPose
 from factorgrasp.typing import FloatArray
 
-_DRIFT = float(chi2.ppf(0.9, 6))
+_DRIFT = float(chi2.ppf(0.99, 6))
+_FEWEST = 4
 _STEPS = 6
 
 
@@ -46,6 +47,10 @@ def in_start_frame(
     with_layout : (D, 3n or 0) ndarray
     """
     R_0 = start.rotation
+    if not np.isfinite(covariance[:6, :6]).all():
+        nothing = np.full(3, np.nan)
+        unknown = np.diag(np.full(6, np.inf))
+        return WristPoseIn0(np.full((3, 3), np.nan), nothing, nothing, nothing, unknown, unknown)
     rotation, position = R_0.T @ R, R_0.T @ (x[:3] - start.position)
     # theta = theta_k - R' theta_0, and p = R_0' (dp_k - dp_0) + [p]x theta_0.
     own, other = np.zeros((6, 6)), np.zeros((6, 6))
@@ -188,7 +193,7 @@ class StartFrame:
         times = np.array([*self._t, t])
         if self.pose is not None:
             R, p = self.pose.rotation, self.pose.position
-            if times.size > 2 and moved(self._camera, self._points, joined, times, R, p):
+            if times.size >= _FEWEST and moved(self._camera, self._points, joined, times, R, p):
                 self.closed = True
                 return
         self.pose = start_pose(self._camera, self._points, self._layout, joined, R, p)

@@ -49,6 +49,7 @@ class FirstPass:
     clutter: float
     densities: FloatArray
     layout: FloatArray
+    not_rigid: bool
 
 
 def track_forward(
@@ -74,7 +75,13 @@ def track_forward(
         lagged[number] = node
     whole = tuple(node if node is not None else newest[k] for k, node in enumerate(lagged))
     first = FirstPass(
-        whole, given, tracker.detection, tracker.clutter, tracker.window.densities, tracker.layout.copy()
+        whole,
+        given,
+        tracker.detection,
+        tracker.clutter,
+        tracker.window.densities,
+        tracker.layout.copy(),
+        tracker.not_rigid,
     )
     return first, tuple(newest)
 
@@ -125,7 +132,6 @@ class WristPose:
         self.round = 0
         blobs.check_camera(camera)
         self.size = NODE_SIZE[self.noise.motion]
-        self.estimates_layout = self.settings.layout == "estimate" and bool(np.any(markers.covariance > 0.0))
         scale = self.settings.loss_scale
         self.loss = GemanMcClure(scale) if np.isfinite(scale) else None
 
@@ -170,6 +176,19 @@ class WristPose:
             "the intrinsics"
         )
 
+    @cached_property
+    def estimates_layout(self) -> bool:
+        """Whether the layout is an unknown: when that is asked for, it is uncertain, and the markers behave as a rigid palm's."""
+        uncertain = bool(np.any(self.markers.covariance > 0.0))
+        return self.settings.layout == "estimate" and uncertain and not self.first_pass.not_rigid
+
+    @property
+    def layout_is_noise(self) -> bool:
+        """Whether the layout's covariance is added to every residual."""
+        return self.settings.layout == "noise" or (
+            self.settings.layout == "estimate" and self.first_pass.not_rigid
+        )
+
     # ---- the batch as it is posed now
 
     @cached_property
@@ -187,7 +206,7 @@ class WristPose:
         rows = np.flatnonzero((marker > 0) & (self.blobs.frame >= first) & (self.blobs.frame <= last))
         C = self.covariances[rows]
         chosen = marker[rows] - 1
-        if self.settings.layout == "noise":
+        if self.layout_is_noise:
             nodes = self.first_pass.nodes
             R = np.stack([nodes[f].R for f in self.blobs.frame[rows]])
             p = np.stack([nodes[f].x[:3] for f in self.blobs.frame[rows]])
@@ -360,7 +379,7 @@ class WristPose:
         rates = Rates(posed.detection, posed.clutter, self.camera.pixels)
         marker = posed.marker.copy()
         visible = hits = clutter = 0
-        blocks = self.markers.blocks if self.settings.layout == "noise" else np.zeros((len(layout), 3, 3))
+        blocks = self.markers.blocks if self.layout_is_noise else np.zeros((len(layout), 3, 3))
         for i, k in enumerate(self.frames):
             rows = self.blobs.rows(k)
             if rows.start == rows.stop:

@@ -30,6 +30,8 @@ _MEMORY_FRAMES = 300.0
 _MEMORY_SECONDS = 3.0
 _DENSITY_WEIGHT = 3.0
 _DENSITY_BOUNDS = (0.1, 100.0)
+NOT_RIGID = 70.0
+"""Squared deviation of the learnt layout in its own covariance: of 18 coordinates, less than one in a million rigid palms."""
 _DECISIVE_FRAMES = 8
 """Frames in a row that have to decide between two poses before one of them is believed without reserve."""
 
@@ -136,6 +138,7 @@ class WristTracker:
         self._fit = np.zeros((2, 2))
         self._poor = 0
         self._shallow = 0
+        self.not_rigid = False
         self._last_doubt: FloatArray | None = None
         self._against = self._decisive = 0
         self._handed_over: list[tuple[int, Node]] = []
@@ -242,6 +245,8 @@ class WristTracker:
         self._flags[-1] = used, doubt
         if self._against >= 3 and doubt is not None:
             self._turn_over(doubt)
+        elif self._contradicts_layout():
+            self._stop_learning(uvz, covariance, marker)
         newest = self._newest(t, used, doubt)
         finished += self._handed_over
         self._handed_over = []
@@ -344,7 +349,7 @@ class WristTracker:
     ) -> Pairs:
         used = np.flatnonzero(marker >= 0)
         C = covariance[used]
-        if self.settings.layout == "noise" and used.size:
+        if (self.settings.layout == "noise" or self.not_rigid) and used.size:
             points = self.window.layout[marker[used]]
             shape = (used.size, 3, 3)
             J = predict(
@@ -453,6 +458,27 @@ class WristTracker:
         self.window.densities = np.where(fixed, usual, found)
 
     # ---- results
+
+    def _contradicts_layout(self) -> bool:
+        """Whether the markers that were learnt cannot be those that were measured: not rigid, or not where they were said to be."""
+        s = self.window.shared
+        if not s:
+            return False
+        away = (self.window.layout - self.markers.points).ravel()
+        return float(away @ np.linalg.solve(self.markers.covariance + 1e-12 * np.eye(s), away)) > NOT_RIGID
+
+    def _stop_learning(self, uvz: FloatArray, covariance: FloatArray, marker: IntArray) -> None:
+        """From here on the layout is the measured one, and its covariance is noise of every residual."""
+        w = self.window
+        R, x, t, doubt = w.R[-1], w.x[-1], w.t[-1], self._flags[-1][1]
+        self._handed_over += self._drain_but_newest()
+        self.not_rigid = True
+        self.window = Window(
+            self.camera, self.markers.points.copy(), None, w.motion, w.densities, w.lag, w.loss_scale
+        )
+        self.window.start(t, R, x[:3], POSE_SD, RATE_SD)
+        self.window.refresh(self._pairs(uvz, covariance, marker, R, x))
+        self._frames, self._flags = [self.frame], [(bool(np.any(marker >= 0)), doubt)]
 
     def _turn_over(self, doubt: FloatArray) -> None:
         """The pixels of several frames speak for the other pose: go on from there."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -116,7 +118,7 @@ def test_marginals_of_a_chain_are_those_of_the_inverse(rng: np.random.Generator)
     tail = slice(n * D, None)
     chain = Chain(
         np.stack([H[b, b] for b in blocks]),
-        np.stack([H[a, b] for a, b in zip(blocks[:-1], blocks[1:], strict=True)]),
+        np.stack([H[a, b] for a, b in pairwise(blocks)]),
         np.stack([H[b, tail] for b in blocks]),
         H[tail, tail],
     )
