@@ -13,7 +13,7 @@ from factorgrasp.losses import make_loss
 from factorgrasp.models.camera import Camera
 from factorgrasp.models.marker_files import write_layout
 from factorgrasp.models.markers import MarkerLayout
-from factorgrasp.problems.palm_labels import MOST_POINTS, Labelling, label_points
+from factorgrasp.problems.palm_labels import MOST_POINTS, Labelling, label_points, nearest_together
 from factorgrasp.problems.palm_layout import PalmConvention, PalmLayout, PalmView, in_palm_frame, palm_frame
 from factorgrasp.recordings.blobs import BlobFrame, BlobRecording
 from factorgrasp.solvers.solve import solve
@@ -177,9 +177,10 @@ def _collect(
         counts.append(known.size)
         if known.size < markers:
             continue
-        # Detectors put the blobs most like a marker first.
-        known = known[:MOST_POINTS]
         points = camera.back_project(frame.uv[known], frame.depth[known])
+        if known.size > MOST_POINTS:
+            near = nearest_together(points, MOST_POINTS)
+            known, points = known[near], points[near]
         found: Labelling | None
         if layout is None:
             found = label_points(points, template.points)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import combinations, permutations
 
 import numpy as np
 
 from factorgrasp.typing import FloatArray, IntArray
 
+_MOST_UNLIKE = 0.04
+"""m: a distance between two markers of a hand differs less from that of the template, scaled."""
 MOST_POINTS = 9
 """Points that all labellings are tried of; 6 of 9 are 60480."""
 
@@ -41,6 +44,33 @@ class Labelling:
     second: float
 
 
+def nearest_together(points: FloatArray, count: int, reach: float = 0.16) -> IntArray:
+    """The `count` points (as sorted rows) with the most others within `reach` (m) of them: a hand among clutter."""
+    away = np.linalg.norm(points[:, None] - points[None], axis=2)
+    near = (away < reach).sum(axis=1)
+    return np.sort(np.argsort(-near, kind="stable")[:count])
+
+
+@lru_cache(maxsize=8)
+def _all_orders(count: int, markers: int) -> IntArray:
+    """Every choice of points for the markers, in every order."""
+    chosen = [order for some in combinations(range(count), markers) for order in permutations(some)]
+    return np.array(chosen, dtype=np.intp)
+
+
+def _alike(
+    points: FloatArray, template: FloatArray, orders: IntArray, scales: tuple[float, float]
+) -> IntArray:
+    """Orders under which no distance between two points differs much from the template's: they alone are worth aligning."""
+    first, second = np.triu_indices(template.shape[0], 1)
+    wanted = np.linalg.norm(template[first] - template[second], axis=1)
+    away = np.linalg.norm(points[:, None] - points[None], axis=2)
+    found = away[orders[:, first], orders[:, second]]
+    scale = np.clip(found @ wanted / (wanted @ wanted), *scales)
+    worst = np.abs(found - scale[:, None] * wanted).max(axis=1)
+    return np.asarray(orders[worst < _MOST_UNLIKE])
+
+
 def label_points(
     points: FloatArray, template: FloatArray, scales: tuple[float, float] = (0.7, 1.35), facing: bool = True
 ) -> Labelling | None:
@@ -68,10 +98,9 @@ def label_points(
     count, markers = points.shape[0], template.shape[0]
     if not markers <= count <= MOST_POINTS:
         return None
-    orders = np.array(
-        [order for chosen in combinations(range(count), markers) for order in permutations(chosen)],
-        dtype=np.intp,
-    )
+    orders = _alike(points, template, _all_orders(count, markers), scales)
+    if orders.shape[0] == 0:
+        return None
     model = template - template.mean(axis=0)
     chosen = points[orders]
     middle = chosen.mean(axis=1)

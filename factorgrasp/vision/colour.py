@@ -272,7 +272,14 @@ def _patch_mask(image: ByteImage, patch: object) -> BoolArray:
         )
     mask = np.zeros((h, w), dtype=bool)
     mask[v0:v1, u0:u1] = True
-    return mask
+    # A box drawn around a marker holds skin at its corners: what looks like the frame of the box is none of the marker.
+    frame = mask.copy()
+    frame[max(v0 - 2, 0) : v1 + 2, max(u0 - 2, 0) : u1 + 2] = True
+    frame &= ~mask
+    x, y = (channel / LOG_STEPS for channel in log_chroma(image))
+    away = np.hypot(x - np.median(x[frame]), y - np.median(y[frame]))
+    inner = mask & (away > max(0.6 * float(np.quantile(away[mask], 0.98)), _LEAST_CONTRAST))
+    return inner if 0.1 * mask.sum() < inner.sum() and inner.sum() >= 4 else mask
 
 
 def histogram(x: ArrayLike, y: ArrayLike) -> FloatArray:

@@ -10,6 +10,8 @@ _SEVERAL = 24
 """px: a component of that size may be several markers."""
 _MOST_FUZZY = 3.5
 """Size of a component relative to its sure inside from which only the inside is taken."""
+_MOST_PARTS = 30
+"""Of one component: denim in noise has thousands."""
 MOST = 200
 """Components that are looked at."""
 
@@ -34,18 +36,22 @@ def find_components(seeds: Any, least: int, most: int, cv2: Any) -> tuple[Any, l
         box = (slice(top, top + height), slice(left, left + width))
         if count >= _SEVERAL:
             sure = ((labels[box] == label) & (seeds[box] == 2)).astype(np.uint8)
-            found, inner, parts, _ = cv2.connectedComponentsWithStatsWithAlgorithm(
+            _, inner, parts, _ = cv2.connectedComponentsWithStatsWithAlgorithm(
                 sure, 8, cv2.CV_16U, cv2.CCL_BBDT
             )
-            sound = [i for i in range(1, found) if parts[i, cv2.CC_STAT_AREA] >= max(least, 4)]
-            core = sum(int(parts[i, cv2.CC_STAT_AREA]) for i in sound)
+            sizes = parts[:, cv2.CC_STAT_AREA].copy()
+            sizes[0] = 0
+            sound = np.flatnonzero(sizes >= max(least, 4))
+            sound = sound[np.argsort(-sizes[sound], kind="stable")][:_MOST_PARTS]
+            core = int(sizes[sound].sum())
             # Grey cloth has the colour of a marker's edge, and joins the marker that it half hides.
             fuzzy = count > most or count > _MOST_FUZZY * core
-            if sound and (len(sound) > 1 or fuzzy) and following + len(sound) < 60_000:
+            if sound.size and (sound.size > 1 or fuzzy) and following + sound.size < 60_000:
                 labels[box][labels[box] == label] = 0
                 for i in sound:
-                    labels[box][inner == i] = following
                     x, y, w, h, n = (int(value) for value in parts[i])
+                    place = (slice(y, y + h), slice(x, x + w))
+                    labels[box][place][inner[place] == i] = following
                     out.append((following, (left + x, top + y, w, h, n)))
                     following += 1
                 continue

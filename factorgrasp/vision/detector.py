@@ -43,6 +43,10 @@ _SHARES = (0.22, 3.6)
 """Area of anything that may be markers."""
 _SURE = 3
 """Whole markers of one size that settle it."""
+_LONGEST = 5.0
+"""Square of a component's extent relative to the largest area: discs have 1.3, ellipses of ratio 3.5 have 4.5."""
+_SPARSEST = 0.2
+"""Share of its box that a component fills: a disc 0.79, the halves of two that touch 0.5."""
 _FEW = 6
 """Blobs: with fewer, another lamp is considered."""
 
@@ -179,8 +183,11 @@ class BlobDetector:
             stats = kept
         out = []
         for label, (left, top, width, height, area) in stats[:_MOST_EXAMINED]:
-            if area > most:
+            if area > most or max(width, height) ** 2 > _LONGEST * most:
                 rejected["too large"] += 1
+                continue
+            if area < _SPARSEST * width * height:
+                rejected["other shape"] += 1
                 continue
             rows = slice(max(top - _MARGIN, 0), min(top + height + _MARGIN, image.shape[0]))
             columns = slice(max(left - _MARGIN, 0), min(left + width + _MARGIN, image.shape[1]))

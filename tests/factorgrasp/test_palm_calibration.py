@@ -123,6 +123,22 @@ def test_the_other_hand_is_not_taken_for_this_one() -> None:
     assert right is None or left.rms < 0.7 * right.rms
 
 
+def test_a_hand_is_found_among_much_clutter() -> None:
+    rng = np.random.default_rng(11)
+    layout = random_hand(rng)
+    blobs, rows = make_blobs(layout, rng, frames=3, clutter=0)
+    t, uv, depth, frame, shift = blobs.t, [], [], [], []
+    for k in range(3):
+        far = CAMERA.project(np.column_stack([rng.uniform(-0.3, 0.3, (12, 2)), rng.uniform(0.9, 1.1, 12)]))
+        uv += [far, blobs.at(k).uv]
+        depth += [rng.uniform(0.9, 1.1, 12), blobs.at(k).depth]
+        frame += [k] * (12 + len(blobs.at(k)))
+        shift.append(12 * (k + 1))
+    cluttered = BlobRecording(t, np.array(frame), np.concatenate(uv), np.concatenate(depth))
+    found = calibrate_palm(cluttered, CAMERA)
+    np.testing.assert_array_equal(found.blobs, rows + np.array(shift)[:, None])
+
+
 def test_what_cannot_be_calibrated_is_said() -> None:
     rng = np.random.default_rng(7)
     blobs, rows = make_blobs(np.array(PALM_POINTS), rng, clutter=0)

@@ -171,7 +171,9 @@ def test_markers_of_another_size_than_said_are_found(reference: ColourReference,
 
 
 def test_most_markers_half_hidden_do_not_make_halves_whole(reference: ColourReference) -> None:
-    hidden = tuple(Hidden(marker, 0.5, angle=angle) for marker, angle in ((0, 3.5), (1, 2.0), (2, 0.9), (5, 4.6)))
+    hidden = tuple(
+        Hidden(marker, 0.5, angle=angle) for marker, angle in ((0, 3.5), (1, 2.0), (2, 0.9), (5, 4.6))
+    )
     frame = hand(HandScene(hidden=hidden), seed=0)
     blobs = BlobDetector(reference, camera=CAMERA).detect(frame.rgb, frame.depth)
     away, which = nearest(blobs, frame)
@@ -239,6 +241,8 @@ def test_click_patch_and_mask_learn_the_same_colour(tmp_path: Path) -> None:
     mask[v - 2 : v + 3, u - 2 : u + 3] = True
     np.testing.assert_allclose(by_patch.marker, learn_colour(frame.rgb, patch=mask).marker)
     assert np.linalg.norm(by_click.marker_mean - by_patch.marker_mean) < 0.1
+    around = learn_colour(frame.rgb, patch=(int(u) - 8, int(v) - 8, int(u) + 9, int(v) + 9))
+    assert np.linalg.norm(around.marker_mean - by_click.marker_mean) < 0.2
     stored = read_colour(by_click.save(tmp_path / "blue.json"))
     np.testing.assert_allclose(stored.table, by_click.table)
     with pytest.raises(InputError, match="colour reference"):
