@@ -19,8 +19,11 @@ from factorgrasp.typing import FloatArray, IntArray
 
 MARGIN = 5.0
 """Logarithm of the odds against the second best pose that is asked for."""
-EVIDENCE = 8.0
+EVIDENCE = 10.0
 """Logarithm of the odds against clutter that is asked for."""
+EVIDENCE_OF_THREE = 25.0
+"""The same where only three blobs speak for a pose of which nothing was known: chance makes triangles that score up to 24, true ones 26 and
+more."""
 MOST_TRIPLES = 600
 _REFINED = 6
 _WIDE = np.array([0.5, 0.5, 0.5, 0.15, 0.15, 0.15])
@@ -111,7 +114,8 @@ def search(
     rivals = [f.assignment.score for f in found[1:] if not _same(best, f.R, f.p, 0.25, 0.03)]
     margin = best.assignment.score - max([0.0, *rivals])
     second = best.assignment.score - max(rivals, default=-np.inf)
-    if best.assignment.score < EVIDENCE or second < MARGIN:
+    asked = EVIDENCE_OF_THREE if guess is None and best.assignment.count == 3 else EVIDENCE
+    if best.assignment.score < asked or second < MARGIN:
         return None
     return Found(best.R, best.p, best.covariance, best.assignment, min(margin, second))
 
