@@ -105,8 +105,9 @@ class WristTask:
         measures = wrist_measures(solved.track, self.hand, self.facing)
         track = solved.track
         riding = riding_blobs(track, self.problem.blobs, self.problem.camera)
-        doubts = (*seen_from_behind(track), *riding_words(riding))
-        status, message = self._judged(solved, doubts)
+        behind, others = seen_from_behind(track), riding_words(riding)
+        status, message = self._judged(solved, behind, others)
+        doubts = (*behind, *others)
         warnings = [*self.remarks, *solved.warnings, *doubts, *measures.words]
         estimate = replace(solved.estimate, status=status, message=message)
         return WristResult(
@@ -214,7 +215,9 @@ class WristTask:
         clutter = problem.blobs.frame.size / max(n, 1)
         return WristPoseEstimate(estimate, track, 0.0, clutter, nan, nan, nan, nan, nan, nan)
 
-    def _judged(self, solved: WristPoseEstimate, doubts: tuple[str, ...]) -> tuple[Status, str]:
+    def _judged(
+        self, solved: WristPoseEstimate, behind: tuple[str, ...], others: tuple[str, ...]
+    ) -> tuple[Status, str]:
         """Whether the track as a whole answers the question."""
         status, message = solved.estimate.status, solved.estimate.message
         track = solved.track
@@ -232,9 +235,11 @@ class WristTask:
                 f"the hand was found in {100.0 * found:.0f} % of the frames only; check the layout, the units of the depth and the "
                 "intrinsics"
             )
-        if doubts and solved.detection < LEAST_DETECTION:
+        # A layout with its z axis the other way round fits well from behind; a mirror image leaves blobs that fit nowhere.
+        if (behind and others) or ((behind or others) and solved.detection < LEAST_DETECTION):
             return Status.INFEASIBLE, (
-                f"no motion of this layout explains the blobs: only {100.0 * solved.detection:.0f} % of its markers are seen, and "
-                f"{doubts[-1]} Are the intrinsics right?"
+                f"no motion of this layout explains the blobs, {100.0 * solved.detection:.0f} % of its markers are seen: "
+                + " ".join((*behind, *others))
+                + " Are the intrinsics right?"
             )
         return status, message

@@ -211,6 +211,12 @@ def _movement(
     rate: float,
     smallest: float,
 ) -> Movement | None:
+    # Nothing further away than the windows of the jerk and the search for the ends matters.
+    first, peak, last = where
+    margin = round(_NEAR * rate) + (last - first) // 2 + 5
+    low, high = max(0, first - margin), last + margin + 1
+    clock, p, v, slow = clock[low:high], p[:, low:high], v[:, low:high], slow[:, low:high]
+    where = (first - low, peak - low, last - low)
     found = [_describe(clock, p[k], slow[k], where, onset, rate) for k in range(len(p))]
     own = found[0]
     if own is None or not own["distance"] >= smallest:

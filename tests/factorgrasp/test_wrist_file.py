@@ -418,7 +418,8 @@ def test_the_other_hands_layout_is_noticed(changed: Callable[..., Path], tmp_pat
         )
 
     result = run("solve", changed(mirror), "--out", tmp_path / "out")
-    assert "the layout that of the other hand" in result.stdout.replace("\n", " ") or result.exit_code == 1
+    assert result.exit_code == 1
+    assert "the layout that of the other hand" in result.stderr
 
 
 def test_images_with_depth_to_the_pose(tmp_path: Path) -> None:
