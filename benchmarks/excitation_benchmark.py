@@ -135,7 +135,7 @@ def panda(tight: bool) -> ExcitationPlan:
     spheres, pairs = link_spheres(robot, PANDA, full, START, 0.01)
     R, p = tool_pose(model, "panda_hand", START)
     settings = ExcitationSettings(alpha=10.0, window=5.0, duration=10.0, bandwidth=1.0)
-    arm = ArmTask(robot, "panda_hand", limits, START, None, spheres, pairs[:40])
+    arm = ArmTask(robot, "panda_hand", limits, START, None, spheres, pairs[:40], pairs[40:])
     return plan_excitation(
         Excitation(
             grasp, static_human(10.0, p + R @ LEVER, R), settings, HumanWrist(max_rotation=0.15), arm=arm
