@@ -72,7 +72,7 @@ def plan_excitation(
     """
     began = time.perf_counter()
     chosen = solver or get_nlp_solver()
-    outside = _outside(problem)
+    outside = _outside(problem) or _blind(problem)
     start = problem.start(seed)
     space = problem.task
     if outside:
@@ -163,7 +163,7 @@ def _words(problem: Excitation, result: ExchangeResult) -> str:
     if result.status is not Status.INFEASIBLE:
         return f"{result.message}; near its end bind: " + ("; ".join(limits[:4]) or "no limit")
     words = f"{asked} cannot be had within the limits: about {max(result.share, result.check.share):.2g} of it can"
-    blind = _blind(problem, result)
+    blind = _blind(problem)
     if limits:
         words += "; what binds: " + "; ".join(limits[:5])
     if blind:
@@ -173,7 +173,7 @@ def _words(problem: Excitation, result: ExchangeResult) -> str:
     return words
 
 
-def _blind(problem: Excitation, result: ExchangeResult) -> str:
+def _blind(problem: Excitation) -> str:
     """The lever arm along which nothing can be seen, when the motion keeps one axis."""
     s = problem.settings
     if s.axes != "travel" or s.alpha is None:
