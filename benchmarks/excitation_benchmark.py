@@ -80,7 +80,9 @@ def task(wrist: HumanWrist | None = None, **settings: Any) -> Excitation:
 def coning() -> Iterator[Metric]:
     """Against ``lambda_min = T w^4 A^2 / 2``, steady and from rest to rest."""
     for bandwidth in (0.5, 1.0, 2.0):
-        plan = plan_excitation(task(rest=False, centred=False, bandwidth=bandwidth, alpha=10.0 * bandwidth))
+        plan = plan_excitation(
+            task(rest=False, centred=False, bandwidth=bandwidth, alpha=10.0 * bandwidth, duration=5.0)
+        )
         ratio = plan.coning_ratio if plan.status.ok and plan.share >= 1.0 else np.nan
         yield Metric(
             f"coning/steady_{bandwidth:g}_hz",
@@ -135,7 +137,7 @@ def panda(tight: bool) -> ExcitationPlan:
     spheres, pairs = link_spheres(robot, PANDA, full, START, 0.01)
     R, p = tool_pose(model, "panda_hand", START)
     settings = ExcitationSettings(alpha=10.0, window=5.0, duration=10.0, bandwidth=1.0)
-    arm = ArmTask(robot, "panda_hand", limits, START, None, spheres, pairs[:40])
+    arm = ArmTask(robot, "panda_hand", limits, START, None, spheres, pairs[:40], pairs[40:])
     return plan_excitation(
         Excitation(
             grasp, static_human(10.0, p + R @ LEVER, R), settings, HumanWrist(max_rotation=0.15), arm=arm

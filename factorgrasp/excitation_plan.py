@@ -184,7 +184,7 @@ class ExcitationPlan:
             "alpha": s.alpha, "window": s.window_length, "centred": s.centred, "share": self.share,
             "lambda_min": float(np.min(self.lambda_min)) if s.alpha is not None else None,
             "lambda_min_per_window": [
-                {"start": float(a), "lambda_min": float(b)} 
+                {"start": float(a), "lambda_min": float(b)}
                 for a, b in zip(self._seen(self.check.window_start), self._seen(self.lambda_min), strict=False)
             ],
         }  # fmt: skip

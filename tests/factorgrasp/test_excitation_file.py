@@ -129,7 +129,7 @@ def test_solvers_are_compared(tmp_path: Path) -> None:
     }
     assert rows["ipopt"]["correct"] is True
     assert rows["fatrop"]["correct"] is True
-    assert rows["fatrop"]["objective"] == pytest.approx(rows["ipopt"]["objective"], rel=1e-5)
+    assert rows["fatrop"]["objective"] == pytest.approx(rows["ipopt"]["objective"], rel=0.01)
     assert "nonlinear program" in rows["cholesky"]["skipped"]
 
 
