@@ -237,9 +237,10 @@ class _Arm:
         self.start: FloatArray = start
         self.spheres: Any = ()
         self.pairs: Any = ()
+        self.others: Any = ()
         if self.limits.collision_distance is not None:
             self.spheres, pairs = link_spheres(self.robot, urdf, full, start, self.limits.collision_distance)
-            self.pairs = pairs[:_PAIRS]
+            self.pairs, self.others = pairs[:_PAIRS], pairs[_PAIRS:]
 
     def task(self, grasp: GraspBelief, human: HumanMotion) -> ArmTask:
         """With joint positions that fit the first and the last pose of the wrist."""
@@ -257,7 +258,9 @@ class _Arm:
         R_all = human.orientation(times) @ grasp.rotation.T
         p_all = human.position(times)[0].T - R_all @ grasp.translation
         q, _ = follow(self.model, self.frame, self.limits, start, R_all, p_all)
-        return ArmTask(self.robot, self.frame, self.limits, start, q[:, -1], self.spheres, self.pairs)
+        return ArmTask(
+            self.robot, self.frame, self.limits, start, q[:, -1], self.spheres, self.pairs, self.others
+        )
 
 
 def _wrist_pose(

@@ -51,7 +51,7 @@ class ExcitationPlan:
     binding : tuple of str
         Limits that bind.
     predicted_covariance : ndarray (6, 6)
-        Of [turn about the end-effector's axes, lever arm] after the motion, from the grasp estimator's information and what was known before.
+        Of [turn about the end-effector's axes, lever arm] after the motion, by the grasp estimator's information and what was known.
     """
 
     estimate: Estimate
@@ -98,7 +98,7 @@ class ExcitationPlan:
         return ExcitationPlan(
             estimate, problem, space, C, t, read[:, 9:12], R, read[:, 12:15], read[:, 15:18], read[:, 18:21], turn, q, qd, qdd, tau,
             np.hstack([wrist.force_stiffness * away, moment]), wrist.force_stiffness * np.sqrt(np.maximum(read[:, 24], 0.0)),
-            check, share, binding, np.linalg.inv(information),
+            check, share, binding, np.asarray(np.linalg.inv(information), dtype=np.float64),
         )  # fmt: skip
 
     @property
@@ -184,7 +184,8 @@ class ExcitationPlan:
             "alpha": s.alpha, "window": s.window_length, "centred": s.centred, "share": self.share,
             "lambda_min": float(np.min(self.lambda_min)) if s.alpha is not None else None,
             "lambda_min_per_window": [
-                {"start": float(a), "lambda_min": float(b)} for a, b in zip(self._seen(self.check.window_start), self._seen(self.lambda_min), strict=False)
+                {"start": float(a), "lambda_min": float(b)}
+                for a, b in zip(self._seen(self.check.window_start), self._seen(self.lambda_min), strict=False)
             ],
         }  # fmt: skip
         out["predicted_sd"] = {
@@ -208,7 +209,7 @@ class ExcitationPlan:
         return out
 
     def save(self, directory: str | Path) -> Path:
-        """Write ``trajectory.csv``, ``estimate.npz`` and ``estimate.json`` into `directory`, each atomically; returns the last one's path."""
+        """Write ``trajectory.csv``, ``estimate.npz`` and ``estimate.json`` into `directory`, each atomically; returns the JSON's path."""
         from factorgrasp.results import write_result
 
         folder, columns = Path(directory), self.table()

@@ -34,8 +34,8 @@ def build(plan: ExcitationPlan) -> Report:
         sections.append(_joints(plan))
     sections += [_margins(plan), _table(plan)]
     sentence = plan.message[:1].upper() + plan.message[1:] + "." if plan.message else (
-        f"A motion of {s.duration:g} s that reveals the grasp: every window has the excitation asked for, and no limit is violated anywhere "
-        f"on a grid of {1000.0 * s.step:g} ms."
+        f"A motion of {s.duration:g} s that reveals the grasp: every window has the excitation asked for, and no limit is violated "
+        f"anywhere on a grid of {1000.0 * s.step:g} ms."
     )  # fmt: skip
     return Report("Planned excitation", sentence, cards, tuple(sections))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import time
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from factorgrasp.typing import FloatArray
 
 MISSED = 1e-3
 """m and rad: a tool pose that inverse kinematics misses by more is out of the robot's reach."""
+MOST_PAIR_ROUNDS = 3
 IK_STEPS = 8
 """Poses per period of the bandwidth that inverse kinematics follows."""
 
@@ -70,7 +72,7 @@ def plan_excitation(
     """
     began = time.perf_counter()
     chosen = solver or get_nlp_solver()
-    outside = _outside(problem)
+    outside = _outside(problem) or _blind(problem)
     start = problem.start(seed)
     space = problem.task
     if outside:
@@ -91,7 +93,8 @@ def plan_excitation(
             start = problem.fit(space, t, q)
             C = start
             if status.ok and problem.settings.refine:
-                result = solve_by_exchange(problem, space, chosen, start)
+                problem, result = _in_joints(problem, chosen, start)
+                space = problem.joint
                 C, status, message = result.C, result.status, _words(problem, result)
             timing["joint"] = time.perf_counter() - began - sum(timing.values())
     share = 1.0 if result is None else result.share
@@ -117,6 +120,27 @@ def plan_excitation(
     return ExcitationPlan.of(problem, space, C, estimate, check, binding, 0.0 if outside else check.share)
 
 
+def _in_joints(
+    problem: Excitation, solver: NlpSolver, start: FloatArray
+) -> tuple[Excitation, ExchangeResult]:
+    """The plan in joint space; pairs of links that it brings too near are planned with, too."""
+    result = solve_by_exchange(problem, problem.joint, solver, start)
+    for _ in range(MOST_PAIR_ROUNDS):
+        near = problem.near_pairs(result.C)
+        if not near or not result.status.ok:
+            return problem, result
+        assert problem.arm is not None
+        others = tuple(pair for pair in problem.arm.others if pair not in near)
+        problem = problem.with_arm(replace(problem.arm, pairs=problem.arm.pairs + near, others=others))
+        result = solve_by_exchange(problem, problem.joint, solver, result.C)
+    if problem.near_pairs(result.C):
+        words = "; ".join(
+            sorted({f"distance between {words}" for _, _, words in problem.near_pairs(result.C)})[:3]
+        )
+        result = replace(result, status=Status.NOT_CONVERGED, message=f"links come too near: {words}")
+    return problem, result
+
+
 def margin_words(margin: Margin) -> str:
     """A margin in words."""
     what = f"{margin.name}: {margin.value:.4g} {margin.unit} at {margin.time:.2f} s, limit {margin.limit:.4g} {margin.unit}"
@@ -138,8 +162,8 @@ def _words(problem: Excitation, result: ExchangeResult) -> str:
     limits = [word for word in result.binding if not word.startswith("excitation between")]
     if result.status is not Status.INFEASIBLE:
         return f"{result.message}; near its end bind: " + ("; ".join(limits[:4]) or "no limit")
-    words = f"{asked} cannot be had within the limits: about {result.share:.2g} of it can"
-    blind = _blind(problem, result)
+    words = f"{asked} cannot be had within the limits: about {max(result.share, result.check.share):.2g} of it can"
+    blind = _blind(problem)
     if limits:
         words += "; what binds: " + "; ".join(limits[:5])
     if blind:
@@ -149,7 +173,7 @@ def _words(problem: Excitation, result: ExchangeResult) -> str:
     return words
 
 
-def _blind(problem: Excitation, result: ExchangeResult) -> str:
+def _blind(problem: Excitation) -> str:
     """The lever arm along which nothing can be seen, when the motion keeps one axis."""
     s = problem.settings
     if s.axes != "travel" or s.alpha is None:
@@ -181,7 +205,7 @@ def _outside(problem: Excitation) -> str:
         return f"with this grasp the end-effector begins at {place}, outside the workspace box along {', '.join(axes)}"
     from factorgrasp.problems.excitation_arm import tool_pose
 
-    found_R, found_p = tool_pose(arm.robot.model, arm.frame, arm.start)
+    _found_R, found_p = tool_pose(arm.robot.model, arm.frame, arm.start)
     miss = float(np.linalg.norm(found_p - p))
     if miss > MISSED:
         q, left = arm.start, miss
@@ -191,8 +215,8 @@ def _outside(problem: Excitation) -> str:
             < 0.03 * (arm.limits.position_upper[j] - arm.limits.position_lower[j])
         ]  # fmt: skip
         return (
-            f"the grasp is outside the robot's workspace: the end-effector would have to begin at {place}, {np.linalg.norm(p):.2f} m from the "
-            f"base, and comes no nearer than {left:.3f} m"
+            f"the grasp is outside the robot's workspace: the end-effector would have to begin at {place}, {np.linalg.norm(p):.2f} m from "
+            f"the base, and comes no nearer than {left:.3f} m"
             + (f"; joints at their limits: {', '.join(at)}" if at else "")
         )
     return ""
@@ -219,7 +243,7 @@ def _inverse_kinematics(problem: Excitation, C: FloatArray) -> tuple[FloatArray,
     ]  # fmt: skip
     words = (
         f"the motion leaves the robot's workspace: at {t[k]:.2f} s the end-effector would have to be at "
-        f"({', '.join(f'{x:.3f}' for x in p[k])}) m, {np.linalg.norm(p[k]):.2f} m from the base, and misses it by {errors[k]:.3g} (m and rad)"
+        f"({', '.join(f'{x:.3f}' for x in p[k])}) m, {np.linalg.norm(p[k]):.2f} m from the base, and misses it by {errors[k]:.3g} (m, rad)"
     )
     return (
         t,

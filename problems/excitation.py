@@ -50,6 +50,8 @@ class ArmTask:
         At the end, when the human's wrist ends elsewhere.
     spheres, pairs : tuple
         For the distance between links, see :func:`factorgrasp.problems.excitation_space.joint_space`.
+    others : tuple
+        Pairs that only the finished plan is checked for, and that are planned with when it brings them too near.
     """
 
     robot: Any
@@ -59,6 +61,7 @@ class ArmTask:
     goal: FloatArray | None = None
     spheres: tuple[tuple[int, FloatArray, float], ...] = ()
     pairs: tuple[tuple[int, int, str], ...] = ()
+    others: tuple[tuple[int, int, str], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -181,7 +184,7 @@ class Excitation:
             raise InputError("excitation.axes", '"free", as the wrist does not travel', '"travel"')
         if arm is not None and arm.limits.box_lower is not None and arm.limits.box_upper is not None:
             box = (arm.limits.box_lower, arm.limits.box_upper)
-        self.gravity = np.asarray(gravity, dtype=float)
+        self.gravity, self._start_motion = np.asarray(gravity, dtype=float), start_motion
         self.basis = make_basis(settings.basis, settings.duration, settings.bandwidth)
         self.task = task_space(
             grasp, self.wrist, human, settings, self.basis, self.gravity, box, start_motion
@@ -192,6 +195,12 @@ class Excitation:
             0.0, settings.duration, int(np.ceil(settings.duration / settings.step - 1e-9)) + 1
         )
         self._grid_values: dict[int, FloatArray] = {}
+
+    def with_arm(self, arm: ArmTask) -> Excitation:
+        """The same with another arm."""
+        return Excitation(
+            self.grasp, self.human, self.settings, self.wrist, self.noise, arm, gravity=self.gravity, start_motion=self._start_motion
+        )  # fmt: skip
 
     @cached_property
     def joint(self) -> PlanSpace:
@@ -252,7 +261,7 @@ class Excitation:
         )  # fmt: skip
 
     def start(self, seed: int | None = None) -> FloatArray:
-        """Coefficients to start from in task space: turning about all axes at the highest frequencies, or at random; as strong as asked for."""
+        """Coefficients to start from, as strong as asked for: turning about all axes at the highest frequencies, or at random."""
         space, nb = self.task, self.basis.size
         m = space.motion.coordinates
         if seed is None:
@@ -283,7 +292,7 @@ class Excitation:
                 low = middle
             else:
                 high = middle
-        return base + max(high, 0.02) * C
+        return np.asarray(base + max(high, 0.02) * C)
 
     @cached_property
     def energy_scale(self) -> float:
@@ -340,7 +349,7 @@ class Excitation:
                 path |= {(index, float(t[k])) for k in worst}
         starts, shares = self._grid_windows(space, z, given)
         windows, tighter = set(points.windows), points.tighter
-        if np.min(shares) < needed:
+        if needed > 0.0 and np.min(shares) < needed:
             worst_start = float(starts[int(np.argmin(shares))])
             near = {
                 int(np.clip(k, 0, self._panels - self._window_panels))
@@ -349,12 +358,30 @@ class Excitation:
             if near <= windows:
                 tighter *= (1.0 + 5e-4) * needed / max(float(np.min(shares)), 0.5 * needed)
             windows |= near
+        # Several spheres stand for one link: of limits of one name the nearest speaks.
+        margins.sort(key=lambda one: one.relative)
+        worst_of = {one.name: one for one in reversed(margins)}
         return PlanCheck(
-            tuple(margins),
+            tuple(sorted(worst_of.values(), key=lambda one: one.relative)),
             starts,
             shares,
             Points(frozenset(coordinates), frozenset(path), frozenset(windows), tighter),
         )
+
+    def near_pairs(self, C: FloatArray) -> tuple[tuple[int, int, str], ...]:
+        """Of the arm's other pairs, those that a plan in joint space brings nearer than allowed anywhere on the grid."""
+        arm = self.arm
+        if arm is None or arm.limits.collision_distance is None or not arm.others:
+            return ()
+        from factorgrasp.problems.excitation_arm import sphere_places
+
+        q = self.on_grid(self.joint, C, 0)
+        places, near = sphere_places(arm.robot, arm.spheres, q), []
+        for i, j, words in arm.others:
+            least = arm.spheres[i][2] + arm.spheres[j][2] + arm.limits.collision_distance
+            if np.min(np.sum((places[:, i] - places[:, j]) ** 2, axis=1)) < least**2:
+                near.append((i, j, words))
+        return tuple(near)
 
     def excitation_matrix(self, space: PlanSpace, C: FloatArray, start: float, end: float) -> FloatArray:
         """(3, 3) ``int phi' phi dt`` between two times of the grid, centred where the settings say so."""
@@ -368,7 +395,7 @@ class Excitation:
             symbol, float(self.grid[b] - self.grid[a]), 1.0, self.settings.centred
         )
         values = NodeFunction("G", symbol, ca.SX.sym("p", 0), made).values(s, np.empty((0, 1)))[0]
-        return _full(values[None])[0]
+        return np.asarray(_full(values[None])[0])
 
     def predicted_information(self, space: PlanSpace, C: FloatArray) -> FloatArray:
         """(6, 6) about [turn about the axes of r, lever arm] after the whole motion, what was known before included."""
@@ -388,7 +415,7 @@ class Excitation:
 
     @property
     def _window_panels(self) -> int:
-        return min(int(round(self.settings.window_length / self.panel)), self._panels)
+        return min(round(self.settings.window_length / self.panel), self._panels)
 
     def _panel_length(self) -> tuple[float, int]:
         """Panels of which a window and the duration hold whole numbers, as far as that can be."""
@@ -400,7 +427,7 @@ class Excitation:
         ):
             panel = s.window_length / count
             if abs(s.duration / panel - round(s.duration / panel)) < 1e-6:
-                return panel, int(round(s.duration / panel))
+                return panel, round(s.duration / panel)
         count = int(np.ceil(least * s.duration))
         return s.duration / count, count
 
@@ -441,7 +468,7 @@ class Excitation:
         self, space: PlanSpace, z: FloatArray, given: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         total = _cumulative(self.grid, space.integrand.values(z, given))
-        length = int(round(self.settings.window_length / (self.grid[1] - self.grid[0])))
+        length = round(self.settings.window_length / (self.grid[1] - self.grid[0]))
         inside = (total[length:] - total[: total.shape[0] - length]).T
         values = self._grid_condition.values(inside, np.empty((0, inside.shape[1])))
         shares = (
@@ -449,7 +476,7 @@ class Excitation:
             if self.settings.alpha is not None
             else np.min(values, axis=1)
         )
-        return self.grid[: inside.shape[1]], shares
+        return self.grid[: inside.shape[1]], np.asarray(shares, dtype=np.float64)
 
     @cached_property
     def _grid_condition(self) -> NodeFunction:

@@ -202,8 +202,8 @@ def link_spheres(
 ) -> tuple[tuple[tuple[int, FloatArray, float], ...], tuple[tuple[int, int, str], ...]]:
     """Spheres that cover the collision geometry of the URDF, and the pairs of them whose distance is worth watching.
 
-    Cylinders, capsules and boxes are covered by spheres along their longest axis. Pairs on one link or on neighbouring links are left out, and
-    pairs that are nearer than asked for at the start: there the geometry is too coarse to say anything.
+    Cylinders, capsules and boxes are covered by spheres along their longest axis. Pairs on one link or on neighbouring links are left
+    out, and pairs that are nearer than asked for at the start: there the geometry is too coarse to say anything.
 
     Raises
     ------
@@ -238,7 +238,7 @@ def link_spheres(
             "none (meshes are not read)",
         )
     found = []
-    places = _places(robot, spheres, start)
+    places = sphere_places(robot, spheres, start[:, None])[0]
     for i in range(len(spheres)):
         for j in range(i + 1, len(spheres)):
             (a, first), (b, second) = owner[i], owner[j]
@@ -251,18 +251,20 @@ def link_spheres(
     return tuple(spheres), tuple(pair for _, pair in found)
 
 
-def _places(
+def sphere_places(
     robot: CasadiRobot, spheres: Sequence[tuple[int, FloatArray, float]], q: FloatArray
 ) -> FloatArray:
+    """(n, spheres, 3): where the centres are in the world, for configurations q (nq, n)."""
     import casadi as ca
 
-    motion = robot.motion(ca.DM(q))
-    out = []
+    symbol = ca.SX.sym("q", robot.nq)
+    motion = robot.motion(symbol)
+    points = []
     for joint, centre, _ in spheres:
         c = ca.DM(centre)
-        point = c if joint < 0 else motion.position[joint] + motion.rotation[joint] @ c
-        out.append(np.array(point).ravel())
-    return np.array(out)
+        points.append(ca.SX(c) if joint < 0 else motion.position[joint] + motion.rotation[joint] @ c)
+    function = ca.Function("places", [symbol], [ca.densify(ca.vertcat(*points))])
+    return np.asarray(function.map(q.shape[1])(q).full()).T.reshape(q.shape[1], len(spheres), 3)
 
 
 def _cover(shape: Any) -> list[tuple[FloatArray, float]]:

@@ -1,7 +1,7 @@
 """What excitation, wrench and information are at one instant, as CasADi expressions (mathematics 2.1 and 3).
 
-Frames: world ``w``, end-effector ``r``, the human's hand ``h``; ``d`` marks what the human wants: wrist position ``p_d`` and the orientation
-``R_d`` of the end-effector that goes with the wanted orientation of the hand.
+Frames: world ``w``, end-effector ``r``, the human's hand ``h``; ``d`` marks what the human wants: wrist position ``p_d`` and the
+orientation ``R_d`` of the end-effector that goes with the wanted orientation of the hand.
 """
 
 from __future__ import annotations
@@ -136,7 +136,7 @@ def force_square(instant: Instant, p: Any, covariance: FloatArray) -> Any:
 
 def excitation_moments(instant: Instant) -> list[Any]:
     """``phi'phi`` (6), ``al`` (3), ``vech w w'`` (6): all that the centred excitation matrix needs."""
-    ca = _casadi()
+    _casadi()
     phi = phi_matrix(instant.rate, instant.rate_change)
     return [_upper(phi.T @ phi), instant.rate_change, _upper(instant.rate @ instant.rate.T)]
 
@@ -153,7 +153,7 @@ def centred_excitation(s: Any, length: float, alpha: float, centred: bool) -> An
 
     Centred: what a constant accelerometer bias cannot explain, ``int phi'phi - (int phi)' (int phi) / T``.
     """
-    ca = _casadi()
+    _casadi()
     G = _symmetric(s[1:7])
     if centred:
         mean = _mean_phi(s)
@@ -189,15 +189,15 @@ class SensorNoise:
 def grasp_information(s: Any, noise: SensorNoise, length: float, prior: FloatArray) -> Any:
     """Information (6, 6) about [turn of R about the axes of r, lever arm], biases projected out, from the integrals of a window.
 
-    Residuals (mathematics 2.1): ``e_g = w_r - R w_h`` with Jacobian ``[S(w), 0, I, 0]`` and ``e_a = f_r + phi r - R f_h`` with ``[S(f), phi,
-    0, I]`` by (turn, lever arm, gyroscope bias, accelerometer bias), white with the given densities; `prior` (6, 6) is what was known before.
+    Residuals (mathematics 2.1): ``e_g = w_r - R w_h`` with Jacobian ``[S(w), 0, I, 0]`` and ``e_a = f_r + phi r - R f_h`` with
+    ``[S(f), phi, 0, I]`` by (turn, lever arm, gyroscope bias, accelerometer bias), white with the given densities; `prior` (6, 6) is
+    what was known before.
     """
     ca = _casadi()
     w_g, w_a = 1.0 / noise.gyro**2, 1.0 / noise.accelerometer**2
     WW, FF = _symmetric(s[10:16]), _symmetric(s[19:25])
-    square = lambda M: ca.trace(M) * ca.DM.eye(3) - M  # noqa: E731  # int S(v)' S(v) from int v v'
     cross = ca.reshape(s[28:37], 3, 3)
-    top = ca.horzcat(w_g * square(WW) + w_a * square(FF), w_a * cross)
+    top = ca.horzcat(w_g * _cross_square(WW) + w_a * _cross_square(FF), w_a * cross)
     bottom = ca.horzcat(w_a * cross.T, w_a * _symmetric(s[1:7]))
     information = ca.vertcat(top, bottom) + ca.DM(prior)
     zero = ca.DM.zeros(3, 3)
@@ -208,6 +208,12 @@ def grasp_information(s: Any, noise: SensorNoise, length: float, prior: FloatArr
         mixed = w_a * ca.vertcat(ca.skew(s[25:28]).T, _mean_phi(s).T)
         information -= mixed @ mixed.T / (w_a * length + 1.0 / noise.accelerometer_bias**2)
     return information
+
+
+def _cross_square(M: Any) -> Any:
+    """``int S(v)' S(v)`` from ``int v v'``."""
+    ca = _casadi()
+    return ca.trace(M) * ca.DM.eye(3) - M
 
 
 def variance_ratios(information: Any, targets: FloatArray) -> Any:

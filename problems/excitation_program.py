@@ -1,14 +1,15 @@
 """A motion in a basis as a nonlinear program: an integral to minimise, integrals over windows to keep, limits at instants.
 
-Unknowns are the coefficients C (m, functions) of m coordinates ``x(t) = offset(t) + C b(t)``, and the Cholesky factors of the excitation beyond
-what is asked for:
+Unknowns are the coefficients C (m, functions) of m coordinates ``x(t) = offset(t) + C b(t)``, and the Cholesky factors of the
+excitation beyond what is asked for:
 
     minimise   1/T integral s_0(z, p) dt
     subject to Psi(integral over window w of s(z, p) dt) = I + L_w L_w'      (or >= 1, entry by entry)
                low <= h(z, p) <= high at chosen instants,  low <= a derivative of a coordinate <= high at chosen instants,
                rest at the ends
 
-with ``z = [x, dx/dt, d2x/dt2]``. The first is the persistent-excitation condition; its Cholesky factor as an unknown keeps it smooth and exact.
+with ``z = [x, dx/dt, d2x/dt2]``. The first is the persistent-excitation condition; its Cholesky factor as an unknown keeps it smooth
+and exact.
 All derivatives are exact and are assembled from those of one instant.
 """
 
@@ -22,7 +23,7 @@ import scipy.sparse as sp
 
 from factorgrasp.models.motion_basis import MotionBasis
 from factorgrasp.problems.excitation_node import NodeFunction
-from factorgrasp.typing import FloatArray
+from factorgrasp.typing import FloatArray, IntArray
 
 Given = Callable[[FloatArray], FloatArray]
 """Times (n,) to arrays."""
@@ -174,7 +175,7 @@ class TrajectoryProgram:
             self._count = windows.weights.shape[0]
             self._rows_per_window = windows.condition.size_out
             if windows.matrix:
-                size = int(round((np.sqrt(8 * windows.condition.size_out + 1) - 1) / 2))
+                size = round((np.sqrt(8 * windows.condition.size_out + 1) - 1) / 2)
                 self._aux = _cholesky_function(size)
                 self._per_window = windows.condition.size_out
         self._ny = self._per_window * self._count
@@ -191,8 +192,13 @@ class TrajectoryProgram:
 
     def _linear(self, fixed: Sequence[tuple[float, int, FloatArray]]) -> None:
         """Rows that are linear in the coefficients."""
-        nb, rows, columns, data = self._nb, [], [], []
-        low, high, words = [], [], []
+        nb = self._nb
+        rows: list[int] = []
+        columns: list[int] = []
+        data: list[float] = []
+        low: list[float] = []
+        high: list[float] = []
+        words: list[str] = []
 
         def add(coordinate: int, time: float, order: int, scale: float) -> None:
             values = self.motion.basis.values(np.array([time]), order)[:, 0] / scale
@@ -266,13 +272,13 @@ class TrajectoryProgram:
         columns_all = np.concatenate([A.coords[1], self._window_at[1], path_columns]).astype(int)
         self._J_order, self._J = _fixed_pattern(rows_all, columns_all, (n_a + n_w + n_p, self.size))
         self._A_data = A.data
-        i, j = np.meshgrid(np.arange(nc), np.arange(nc), indexing="ij")
-        h_rows, h_columns = [i.ravel()], [j.ravel()]
+        one, other = np.meshgrid(np.arange(nc), np.arange(nc), indexing="ij")
+        h_rows, h_columns = [one.ravel()], [other.ravel()]
         for w in range(self._count if self._aux is not None else 0):
             block = np.array([*range(nc + w * self._per_window, nc + (w + 1) * self._per_window)])
-            i, j = np.meshgrid(block, block, indexing="ij")
-            h_rows.append(i.ravel())
-            h_columns.append(j.ravel())
+            one, other = np.meshgrid(block, block, indexing="ij")
+            h_rows.append(one.ravel())
+            h_columns.append(other.ravel())
         self._H_order, self._H = _fixed_pattern(np.concatenate(h_rows), np.concatenate(h_columns), (self.size, self.size))  # fmt: skip
 
     # ---- the program ----------------------------------------------------------------------------------------------
@@ -286,7 +292,7 @@ class TrajectoryProgram:
         x = np.zeros(self.size)
         x[: self._nc] = C.ravel()
         if self._aux is not None:
-            size = int(round((np.sqrt(8 * self._per_window + 1) - 1) / 2))
+            size = round((np.sqrt(8 * self._per_window + 1) - 1) / 2)
             where = triangle(size)
             for w, value in enumerate(self._condition(x)):
                 G = np.zeros((size, size))
@@ -394,7 +400,7 @@ class TrajectoryProgram:
     # ---- parts ----------------------------------------------------------------------------------------------------
 
     def _z(self, C: FloatArray, offset: FloatArray, B: FloatArray) -> FloatArray:
-        return (offset + np.matmul(C, B)).reshape(3 * self._m, -1)
+        return np.asarray((offset + np.matmul(C, B)).reshape(3 * self._m, -1))
 
     def _cached(self, x: FloatArray, name: str, make: Callable[[], FloatArray]) -> FloatArray:
         key = x[: self._nc].tobytes()
@@ -405,13 +411,14 @@ class TrajectoryProgram:
             store[name] = make()
         return store[name]
 
+    def _at_nodes(self, x: FloatArray) -> FloatArray:
+        return self._z(self.coefficients(x), self._offset, self._B)
+
     def _values(self, x: FloatArray) -> FloatArray:
-        z = lambda: self._z(self.coefficients(x), self._offset, self._B)  # noqa: E731
-        return self._cached(x, "values", lambda: self._s.values(z(), self._p))
+        return self._cached(x, "values", lambda: self._s.values(self._at_nodes(x), self._p))
 
     def _jacobians(self, x: FloatArray) -> FloatArray:
-        z = lambda: self._z(self.coefficients(x), self._offset, self._B)  # noqa: E731
-        return self._cached(x, "jacobians", lambda: self._s.jacobians(z(), self._p))
+        return self._cached(x, "jacobians", lambda: self._s.jacobians(self._at_nodes(x), self._p))
 
     def _integrals(self, x: FloatArray) -> FloatArray:
         assert self.windows is not None
@@ -429,7 +436,7 @@ class TrajectoryProgram:
         J = J.reshape(n, out, 3, self._m)
         # (n, out m, 3) x (n, 3, nb), one small product an instant.
         V = np.matmul(J.transpose(0, 1, 3, 2).reshape(n, out * self._m, 3), self._B.transpose(2, 0, 1))
-        return (self.windows.weights @ V.reshape(n, -1)).reshape(self._count, out, self._nc)
+        return np.asarray((self.windows.weights @ V.reshape(n, -1)).reshape(self._count, out, self._nc))
 
     def _condition(self, x: FloatArray) -> FloatArray:
         assert self.windows is not None
@@ -468,8 +475,8 @@ def _assembled(H: FloatArray, B: FloatArray) -> FloatArray:
 
 
 def _fixed_pattern(
-    rows: FloatArray, columns: FloatArray, shape: tuple[int, int]
-) -> tuple[FloatArray, sp.csc_array]:
+    rows: IntArray, columns: IntArray, shape: tuple[int, int]
+) -> tuple[IntArray, sp.csc_array]:
     """Where each of a list of entries goes in the data of a CSC matrix, and that matrix."""
     key = columns * shape[0] + rows
     unique, order = np.unique(key, return_inverse=True)

@@ -233,7 +233,7 @@ class RobotLimits:
 
 
 def sensor_densities(noise: GraspNoise, lever: FloatArray) -> tuple[float, float]:
-    """Densities of the gyroscope's and the accelerometer's residual: the hand's sensors and the robot's signals where these are declared."""
+    """Densities of the gyroscope's and the accelerometer's residual: the hand's sensors, and the robot's signals where declared."""
     w = noise.robot_angular_velocity_density or 0.0
     al = noise.robot_angular_acceleration_density or 0.0
     a = noise.robot_acceleration_density or 0.0

@@ -17,6 +17,7 @@ from factorgrasp.least_squares import LeastSquares, QuadraticProgram
 from factorgrasp.problem import LinearProblem, NonlinearProblem
 from factorgrasp.solvers.base import SolverOptions
 from factorgrasp.solvers.compare_cases import Case, LinearCase, NonlinearCase, Outcome, QuadraticCase
+from factorgrasp.solvers.compare_program import ProgramCase
 from factorgrasp.solvers.measure import environment
 from factorgrasp.solvers.registry import solver_class, solver_names
 from factorgrasp.status import Status
@@ -254,6 +255,8 @@ def _cases(
 
 
 def _case(problem: Any) -> Case:
+    if hasattr(problem, "nonlinear_program"):
+        return ProgramCase(problem.nonlinear_program())
     if isinstance(problem, QuadraticProgram):
         return QuadraticCase(problem)
     if isinstance(problem, LeastSquares):
@@ -329,6 +332,8 @@ def _reason_to_skip(name: str, case: Case, named: bool) -> str:
     kind = solver_class(name)
     if not kind.installed():
         return f"not installed: pip install {kind.pip}"
+    if case.takes_program != kind.capabilities.program:
+        return "takes no nonlinear program" if case.takes_program else "for nonlinear programs"
     if case.equalities and not kind.capabilities.equalities:
         return "takes no equalities"
     if case.inequalities and not kind.capabilities.inequalities:

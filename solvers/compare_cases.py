@@ -100,6 +100,7 @@ class Case(ABC):
     inequalities = False
     nonlinear = False
     quadratic = False
+    takes_program = False
 
     @abstractmethod
     def run(self, name: str, options: SolverOptions, repeat: int) -> Outcome:

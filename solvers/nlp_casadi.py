@@ -33,11 +33,17 @@ _WORDS = {
 }
 
 
+_FLOOR = 1e-6
+
+
 class CasadiNlp(NlpSolver):
     """A plugin of ``casadi.nlpsol``."""
 
     plugin: ClassVar[str]
     modules: ClassVar[tuple[str, ...]] = ("casadi",)
+    pip: ClassVar[str] = "casadi"
+    convex: ClassVar[bool] = False
+    """Whether the Hessian has to be positive definite: its eigenvalues are then raised to a floor."""
 
     def plugin_options(self, warm: bool) -> dict[str, Any]:
         """What the plugin is told, from our options."""
@@ -47,8 +53,13 @@ class CasadiNlp(NlpSolver):
         import casadi
 
         began = time.perf_counter()
-        oracle = _oracle(program)
-        options = {"print_time": False, "error_on_fail": False, **self.plugin_options(warm_start is not None)}
+        oracle = _Oracle(program, self.convex)
+        options = {
+            "print_time": False,
+            "error_on_fail": False,
+            "show_eval_warnings": False,
+            **self.plugin_options(warm_start is not None),
+        }
         with _silence():
             solver = casadi.nlpsol("nlp", self.plugin, oracle.function, options)
         inputs: dict[str, Any] = {
@@ -99,7 +110,7 @@ class Ipopt(CasadiNlp):
             "print_level": 0,
             "sb": "yes",
             "tol": self.options.tolerance,
-            "max_iter": self.options.max_iterations or 300,
+            "max_iter": self.options.max_iterations or 200,
             "mu_strategy": "adaptive",
         }
         if warm:
@@ -126,24 +137,22 @@ class Fatrop(CasadiNlp):
 
 
 class SqpMethod(CasadiNlp):
-    """CasADi's SQP with exact, convexified Hessians over the active-set solver qrqp."""
+    """CasADi's SQP with exact Hessians, made convex, over the active-set solver qpOASES.
+
+    Of the QP solvers that come with CasADi, qpOASES and daqp solve the excitation programs; qrqp, osqp, highs, ipqp and proxqp do not.
+    """
 
     name: ClassVar[str] = "sqpmethod"
     plugin: ClassVar[str] = "sqpmethod"
+    convex: ClassVar[bool] = True
 
     def plugin_options(self, warm: bool) -> dict[str, Any]:
         own: dict[str, Any] = {
-            "qpsol": "qrqp",
-            "qpsol_options": {
-                "print_iter": False,
-                "print_header": False,
-                "print_info": False,
-                "error_on_fail": False,
-            },
+            "qpsol": "qpoases",
+            "qpsol_options": {"printLevel": "none", "error_on_fail": False},
             "print_iteration": False,
             "print_header": False,
             "print_status": False,
-            "convexify_strategy": "regularize",
             "max_iter": self.options.max_iterations or 200,
             "tol_pr": self.options.tolerance,
             "tol_du": self.options.tolerance,
@@ -154,10 +163,10 @@ class SqpMethod(CasadiNlp):
 class _Oracle:
     """The function that CasADi sees, and every derivative of it that a solver asked for."""
 
-    def __init__(self, program: NonlinearProgram) -> None:
+    def __init__(self, program: NonlinearProgram, convex: bool) -> None:
         import casadi
 
-        self.program = program
+        self.program, self.convex = program, convex
         self.failure: Exception | None = None
         self.kept: list[Any] = []  # CasADi does not hold its callbacks
         n, m = program.start.size, program.row_lower.size
@@ -194,7 +203,8 @@ class _Oracle:
         factor = float(given["lam:f"][0]) if given["lam:f"].size else 0.0
         if key == "grad:gamma:x":
             return casadi.DM(factor * program.gradient(x) + program.jacobian(x).T @ given["lam:g"])
-        data = program.hessian(x, factor, given["lam:g"]).data
+        found = program.hessian(x, factor, given["lam:g"])
+        data = _raised(found) if self.convex else found.data
         if key.startswith("triu"):
             return casadi.DM(self._triangle, data[self._upper])
         return casadi.DM(self._hessian, data)
@@ -205,8 +215,12 @@ class _Oracle:
         return made
 
 
-def _oracle(program: NonlinearProgram) -> _Oracle:
-    return _Oracle(program)
+def _raised(hessian: sp.csc_array) -> FloatArray:
+    """Entries of the nearest matrix whose eigenvalues are at least the floor; a block-diagonal pattern stays what it is."""
+    values, vectors = np.linalg.eigh(hessian.toarray())
+    raised = (vectors * np.maximum(values, _FLOOR * max(1.0, float(np.max(np.abs(values)))))) @ vectors.T
+    columns = np.repeat(np.arange(hessian.shape[1]), np.diff(hessian.indptr))
+    return np.asarray(raised[hessian.indices, columns])
 
 
 def _callback_class() -> Callable[..., Any]:

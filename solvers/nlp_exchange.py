@@ -18,12 +18,12 @@ from factorgrasp.solvers.nlp import NlpSolver
 from factorgrasp.status import Status
 from factorgrasp.typing import FloatArray
 
-MOST_ROUNDS = 15
-MOST_EASINGS = 8
+MOST_ROUNDS = 12
+MOST_EASINGS = 6
 """Shares of a demand that cannot be met that are tried."""
-CLOSE = 1.25
+CLOSE = 1.4
 """Ratio of a share that is too large to one that is not at which the search ends."""
-QUICK = 60
+QUICK = 40
 """Iterations after which a share counts as too large."""
 LOADED = 1e-4
 """Multiplier, relative to the price of the excitation, above which a limit counts as one that binds."""
@@ -124,13 +124,15 @@ def _most(
     """The largest share of the demand that can be met, by bisection from below; the whole demand if it can be met from there."""
     C, share = _within_limits(problem, space, start, failed.points)
     best: ExchangeResult | None = None
-    low, high = 0.8 * share, 1.0
+    low, high = 0.5 * share, 1.0
     quick = type(solver)(replace(solver.options, max_iterations=QUICK))
     for number in range(MOST_EASINGS):
         if low <= 0.0 or high < CLOSE * low:
             break
         trial = low if number == 0 else min(4.0 * low, 1.0) if high >= 1.0 else float(np.sqrt(low * high))
-        found = _rounds(problem, space, quick, C, failed.points, began, trial, 5)
+        # Even the first is only a guess at what is easy; it decides whether there is anything to go on from.
+        able, most = (solver, 8) if best is None else (quick, 4)
+        found = _rounds(problem, space, able, C, failed.points, began, trial, most)
         if found.status.ok:
             best, C, low = found, found.C, trial
             if trial >= 1.0:
@@ -138,7 +140,7 @@ def _most(
         else:
             high = trial
     if best is None:
-        return replace(failed, share=low)
+        return replace(failed, C=C, check=problem.check(space, C, failed.points, 0.0), share=share)
     words = f"{low:.3g} of it can be had" + (f", less than {high:.3g}" if high < 1.0 else "")
     return replace(best, status=Status.INFEASIBLE, share=low, message=words)
 

@@ -50,9 +50,10 @@ def rnea(robot: CasadiRobot, q: Any, v: Any, a: Any, wrenches: dict[int, Any] | 
 
 
 def joint_torque_regressor(robot: CasadiRobot, q: Any, v: Any, a: Any) -> Any:
-    """(nv, 10 (njoints - 1)): torques per inertial parameter, those of a link being [m, m c (3), Ixx, Ixy, Iyy, Ixz, Iyz, Izz] about its joint.
+    """(nv, 10 (njoints - 1)): torques per inertial parameter.
 
-    The order is that of ``pinocchio.computeJointTorqueRegressor``; armature is not among the parameters.
+    Those of a link are [m, m c (3), Ixx, Ixy, Iyy, Ixz, Iyz, Izz] about its joint. The order is that of
+    ``pinocchio.computeJointTorqueRegressor``; armature is not among the parameters.
     """
     ca = _casadi()
     motion = robot.motion(q, v, a)
