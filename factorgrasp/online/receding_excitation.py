@@ -82,7 +82,7 @@ class RecedingSettings:
         m; an estimate with a larger sd never becomes the reference.
     """
 
-    rotation_sd: float = float(np.deg2rad(0.05))
+    rotation_sd: float = float(np.deg2rad(0.04))
     translation_sd: float = 1.5e-3
     force: float = 3.0
     stiffness: float = 150.0

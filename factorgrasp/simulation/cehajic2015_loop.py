@@ -73,7 +73,7 @@ def cehajic2015_loop(
     pattern: Sinusoids | None = None,
     impedance: Impedance | None = None,
     imu: HandImu = XSENS,
-    time_offset: bool = True,
+    time_offset: bool = False,
     control: JointControl | None = None,
 ) -> GraspLoopResult:
     """The paper's set-up in closed loop.
@@ -107,7 +107,7 @@ def cehajic2015_loop(
     impedance : Impedance
     imu : HandImu
     time_offset : bool
-        Whether the receding plan's estimator also estimates the offset between the clocks. In the paper there is one clock.
+        Whether the online estimator also estimates the offset between the clocks. In the paper there is one clock.
     control : JointControl
 
     Returns
