@@ -207,7 +207,7 @@ def run_calibration(reference: ColourReference, seeds: int, frames: int = 6) -> 
         video = swinging_hand(frames, seed=100 + seed, layout=shape)
         blobs = detect_recording(_Frames(video), XTION, BlobDetector(reference))
         truth = in_palm_frame(MarkerLayout(MarkerLayout.palm().names, shape))
-        for systematic, out in ((1e-4, nees), (0.0, plain)):
+        for systematic, out in ((5e-5, nees), (0.0, plain)):
             found = calibrate_palm(blobs, XTION, side, systematic_sd=systematic).layout
             error = (found.points - truth.points).ravel()
             values, vectors = np.linalg.eigh(found.covariance)

@@ -77,7 +77,7 @@ def calibrate_palm(
     template: MarkerLayout | None = None,
     frames: int = 30,
     look: int = 300,
-    systematic_sd: float = 1e-4,
+    systematic_sd: float = 5e-5,
 ) -> PalmCalibration:
     """The layout from the first frames in which all markers are seen with depth.
 
