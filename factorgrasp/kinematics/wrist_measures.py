@@ -22,6 +22,7 @@ from factorgrasp.kinematics.range_of_motion import RangeOfMotion, range_of_motio
 from factorgrasp.kinematics.reaching import BANDWIDTH, Movement, movements, on_clock
 from factorgrasp.kinematics.smoothness import low_pass
 from factorgrasp.kinematics.track_errors import SAMPLES, sample_tracks
+from factorgrasp.lie import skew, so3_exp
 from factorgrasp.typing import FloatArray, JsonDict
 
 if TYPE_CHECKING:
@@ -116,7 +117,8 @@ def wrist_measures(
     drawn = sample_tracks(
         track.t, R, position, velocity, rate, P, track.velocity_covariance, samples, seed,
     )  # fmt: skip
-    drawn_angles = signs * wrist_angles(drawn.rotation)
+    turn = frame_errors(track.markers.points, track.markers.covariance, samples, seed)[:, None]
+    drawn_angles = signs * wrist_angles(np.swapaxes(turn, -1, -2) @ drawn.rotation @ turn)
     ranges = tuple(
         range_of_motion(
             track.t, angles[:, i], sd[:, i], drawn_angles[..., i], AXES[i], (ISB_NAMES[i], OPPOSITES[i])
@@ -133,6 +135,30 @@ def wrist_measures(
         movements(track.t, position, velocity, drawn.position, drawn.velocity),
         tuple(words),
     )
+
+
+def frame_errors(points: FloatArray, covariance: FloatArray, samples: int, seed: int = 0) -> FloatArray:
+    """Rotations (K, 3, 3) by which the frame ``W`` may be turned against the hand, since its markers are known to a covariance only.
+
+    Such a turn is the same in all frames. It cancels in the rotation against the start up to its axes, so that a motion about one axis
+    shows as one about another: the layout turned by d makes ``Exp(d)' R Exp(d)`` of R.
+
+    Parameters
+    ----------
+    points : ndarray, shape (n, 3)
+        Markers in ``W`` (m).
+    covariance : ndarray, shape (3n, 3n)
+        m^2.
+    samples, seed
+        Number of draws, and what they derive from.
+    """
+    # Displacements d x c_i of a turn about the centre, and the turn that fits displacements best.
+    J = -skew(points - points.mean(axis=0)).reshape(-1, 3)
+    gain = np.linalg.solve(J.T @ J, J.T)
+    values, axes = np.linalg.eigh(gain @ covariance @ gain.T)
+    rng = np.random.default_rng([seed, 78])
+    d = rng.standard_normal((samples, 3)) @ (axes * np.sqrt(np.maximum(values, 0.0))).T
+    return so3_exp(d)
 
 
 def _peak(t: FloatArray, values: FloatArray, drawn: FloatArray, unit: str) -> Measure:

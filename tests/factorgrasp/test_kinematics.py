@@ -23,7 +23,8 @@ from factorgrasp.kinematics import (
     wrist_measures,
     wrist_rotation,
 )
-from factorgrasp.lie import matrix_to_quaternion_wxyz, so3_exp
+from factorgrasp.kinematics.wrist_measures import frame_errors
+from factorgrasp.lie import matrix_to_quaternion_wxyz, project_to_so3, so3_exp, so3_log
 from factorgrasp.models.markers import MarkerLayout
 from factorgrasp.problems.wrist_track import CameraPose, WristTrack
 from factorgrasp.simulation.wrist_motion import WristMotion, wrist_motion
@@ -169,7 +170,7 @@ def _track(motion: str, seed: int, duration: float = 12.0) -> tuple[WristMotion,
     no = np.zeros(t.size, dtype=bool)
     return true, WristTrack(
         t, matrix_to_quaternion_wxyz(R), x[:, 3:], v[:, 3:], np.einsum("nij,nj->ni", E, v[:, :3]), P, V,
-        np.zeros(0, dtype=int), no, no, (), MarkerLayout.palm(), CameraPose(np.eye(3), np.zeros(3)),
+        np.zeros(0, dtype=int), no, no, (), MarkerLayout.palm(0.0), CameraPose(np.eye(3), np.zeros(3)),
     )  # fmt: skip
 
 
@@ -180,7 +181,7 @@ def _exact(true: WristMotion) -> WristMeasures:
     no = np.zeros(n, dtype=bool)
     track = WristTrack(
         true.t, matrix_to_quaternion_wxyz(true.rotation), true.position, true.velocity, true.angular_velocity,
-        tiny, tiny, np.zeros(0, dtype=int), no, no, (), MarkerLayout.palm(), CameraPose(np.eye(3), np.zeros(3)),
+        tiny, tiny, np.zeros(0, dtype=int), no, no, (), MarkerLayout.palm(0.0), CameraPose(np.eye(3), np.zeros(3)),
     )  # fmt: skip
     return wrist_measures(track, samples=3)
 
@@ -275,6 +276,23 @@ def _without(track: WristTrack, hidden: BoolArray) -> WristTrack:
         velocity_covariance=holed(track.velocity_covariance, np.inf),
         lost=hidden,
     )
+
+
+def test_an_uncertain_layout_widens_ranges_of_motion_by_its_turn() -> None:
+    _, track = _track("flexion", 1)
+    sure = wrist_measures(track).range_of_motion
+    loose = wrist_measures(replace(track, markers=MarkerLayout.palm(4e-3))).range_of_motion
+    assert loose[1].range.sd > 1.5 * sure[1].range.sd  # flexion shows as deviation
+    assert loose[0].range.sd < 1.2 * sure[0].range.sd
+    # Drawn layouts, turned back by the best fit.
+    layout, rng = MarkerLayout.palm(2e-3), np.random.default_rng(0)
+    centred = layout.points - layout.points.mean(axis=0)
+    moved = centred + 2e-3 * rng.standard_normal((4000, 6, 3))
+    fitted = so3_log(
+        project_to_so3(np.einsum("kni,nj->kij", moved - moved.mean(axis=1, keepdims=True), centred))
+    )
+    drawn = so3_log(frame_errors(layout.points, layout.covariance, 4000))
+    np.testing.assert_allclose(drawn.std(axis=0), fitted.std(axis=0), rtol=0.08)
 
 
 def test_movements_without_rest_between_them() -> None:
