@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -24,6 +24,9 @@ from factorgrasp.toml_tables import check_keys, close_matches, convert, get, pla
 
 TABLES = ("model", "motion", "forces", "sensors", "covariance", "contacts", "constraints")
 PRESETS = ("default", "latella2018", "tirupachuri2021")
+
+BASE_RESIDUAL = (400.0,) * 6
+"""N^2 and (Nm)^2: what a recorded motion of unstated noise and plates disagree about, commonly 10 to 50 N, as a wrench on the base."""
 
 _NOISE = tuple(field.name for field in fields(HumanDynamicsNoise))
 _OF_JOINTS = ("propagation", "joint_acceleration", "prior_joint_wrench", "prior_joint_acceleration")
@@ -55,7 +58,7 @@ def build(table: Mapping[str, Any], base_dir: Path) -> HumanDynamicsTask:
         "[constraints]",
     )
     covariance = sub_table(table, "covariance")
-    check_keys(covariance, ("preset", "plate", *_NOISE), "[covariance]")
+    check_keys(covariance, ("preset", "plate", "base_residual", *_NOISE), "[covariance]")
     plate = get(covariance, "plate", Six, "[covariance]", PLATE_COVARIANCE)
 
     body = read_body_motion(table, base_dir)
@@ -68,6 +71,11 @@ def build(table: Mapping[str, Any], base_dir: Path) -> HumanDynamicsTask:
     for link in payload:
         if link not in unmeasured:
             raise InputError("[contacts] payload", "links of [contacts] unmeasured", repr(link))
+    base = body.motion.links[body.motion.tree.root]
+    touched = {*unmeasured, *(sensor.link for sensor in wrenches)}
+    residual = _base_residual(covariance, body, base, touched, alone=not unmeasured)
+    if residual is not None:
+        noise = replace(noise, free_wrench=_with_one(noise.free_wrench, base, residual))
     points: dict[str, tuple[float, ...]] = {}
     for link, point in sub_table(contacts, "points").items():
         field = f"[contacts.points] {link}"
@@ -91,6 +99,7 @@ def build(table: Mapping[str, Any], base_dir: Path) -> HumanDynamicsTask:
         method=method,
         constraints=_constraints(constraints, body),
         hard_dynamics=get(constraints, "hard_dynamics", bool, "[constraints]", False),
+        residual=None if residual is None else base,
         extras=body.extras,
     )
 
@@ -112,6 +121,36 @@ def _noise(covariance: Mapping[str, Any], body: BodyMotion) -> HumanDynamicsNois
             known = [j.name for j in body.motion.joints] if key in _OF_JOINTS else list(body.motion.links)
             stated[key] = _per_name(covariance[key], known, place("[covariance]", key))
     return replace(noise, **stated)
+
+
+def _base_residual(
+    covariance: Mapping[str, Any], body: BodyMotion, base: str, touched: Collection[str], alone: bool
+) -> tuple[float, ...] | None:
+    """Variances of the wrench on the base that makes up for errors of motion and masses; None where there is none.
+
+    Accelerations of a trunk are wrong by more than any noise of markers: soft tissue, arms and head as one segment. Where nothing states
+    how wrong, the disagreement is taken up where inverse dynamics leaves it, too, and not by the plates, whose forces would then
+    turn into moments of knee and hip.
+    """
+    field = place("[covariance]", "base_residual")
+    if "base_residual" in covariance:
+        if body.motion.tree.fixed_base or base in touched:
+            raise InputError(field, f"a floating base that nothing else holds ({base})", "one that is held")
+        value = convert(covariance["base_residual"], float | Six, field)
+        variances = np.broadcast_to(np.asarray(value, dtype=float), (6,))
+        if not np.all(variances > 0.0):
+            raise InputError(field, "variances above zero, N^2 and (Nm)^2", f"{value}")
+        return tuple(variances)
+    stated = (
+        body.variances or body.motion.state_noise is not None or {"free_wrench", "preset"} & set(covariance)
+    )
+    unknown = not stated and alone and base not in touched and not body.motion.tree.fixed_base
+    return BASE_RESIDUAL if unknown and touched else None
+
+
+def _with_one(value: PerName, name: str, one: tuple[float, ...]) -> PerName:
+    """Variances with another one for a single name."""
+    return {**value, name: one} if isinstance(value, Mapping) else {"default": value, name: one}
 
 
 def _per_name(value: Any, known: Sequence[str], field: str) -> PerName:

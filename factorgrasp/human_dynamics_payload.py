@@ -49,7 +49,14 @@ class Payload:
     def words(self) -> str:
         """A sentence."""
         verb = "holds" if len(self.links) == 1 else "hold"
-        return f"{' and '.join(self.links)} {verb} {self.mean:.3f} kg (sd {self.mean_sd:.3f} kg in one frame)"
+        words = (
+            f"{' and '.join(self.links)} {verb} {self.mean:.3f} kg (sd {self.mean_sd:.3f} kg in one frame)"
+        )
+        if self.mean < -2.0 * self.mean_sd:
+            words += (
+                ": less than nothing, so the model's masses are too large, or something else carries weight"
+            )
+        return words
 
 
 def contact_rows(

@@ -42,6 +42,8 @@ class HumanDynamicsResult:
         At the good frames.
     weighing : Weighing or None
         None where no force was measured, or an unmeasured contact carries some of the weight.
+    residual : str or None
+        The link on which what motion, masses and forces disagree about acts.
     extras : dict of str to ndarray
         Over all frames: the configurations, where they were estimated.
     """
@@ -54,6 +56,7 @@ class HumanDynamicsResult:
     jointed: tuple[str, ...] = ()
     payload: Payload | None = None
     weighing: Weighing | None = None
+    residual: str | None = None
     extras: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -120,10 +123,13 @@ class HumanDynamicsResult:
             }
             for found in frames.innovations
         ]
+        if self.residual is not None:
+            force, moment = self._residual()
+            out["base_residual"] = {"link": self.residual, "force_rms": force, "moment_rms": moment}
         out["active_constraints"] = sorted({one.meaning for one in frames.active})
         if self.weighing is not None:
             w = self.weighing
-            out["weighing"] = {"mass": w.mass, "sd": w.sd, "model": w.model, "words": w.words}
+            out["weighing"] = {"mass": w.mass, "sd": w.sd, "model": w.model, "nis": w.nis, "words": w.words}
         if self.payload is not None:
             p = self.payload
             out["payload"] = {"links": list(p.links), "mass": p.mean, "sd": p.mean_sd, "words": p.words}
@@ -189,9 +195,20 @@ class HumanDynamicsResult:
             lines.append(f"{gaps} of {self.t.size} frames are gaps (no complete motion there)")
         if self.weighing is not None:
             lines.append(self.weighing.words)
+        if self.residual is not None:
+            force, moment = self._residual()
+            lines.append(
+                f"what motion, masses and forces disagree about acts on {self.residual}: {force:.1f} N, {moment:.1f} Nm RMS"
+            )
         if self.payload is not None:
             lines.append(self.payload.words)
         return "\n".join(lines)
+
+    def _residual(self) -> tuple[float, float]:
+        """RMS size of force and moment that the base link carries, N and Nm."""
+        wrench = self.frames.external_wrench[:, self.frames.links.index(self.residual or "")]
+        square = np.nanmean(wrench**2, axis=0)
+        return float(np.sqrt(square[:3].sum())), float(np.sqrt(square[3:].sum()))
 
     def _all(self, values: FloatArray) -> FloatArray:
         """Values of the good frames on the whole clock."""

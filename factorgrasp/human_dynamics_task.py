@@ -55,6 +55,9 @@ class HumanDynamicsTask:
         with them.
     constraints : sequence of DynamicsConstraint
     hard_dynamics : bool
+    residual : str, optional
+        The link on which what motion, masses and forces disagree about acts (its variance is the noise's `free_wrench`); the result says
+        how large it is.
     extras : mapping of str to ndarray
         Over all frames of the clock, to be written beside the result.
     """
@@ -75,6 +78,7 @@ class HumanDynamicsTask:
         method: Literal["joint", "two_tasks"] = "joint",
         constraints: Sequence[DynamicsConstraint] = (),
         hard_dynamics: bool = False,
+        residual: str | None = None,
         extras: Mapping[str, Any] | None = None,
     ) -> None:
         self.noise, self.contacts, self.payload = (
@@ -116,6 +120,7 @@ class HumanDynamicsTask:
             assert self.momentum is not None
             every = [sensor for sensor in sensors if not isinstance(sensor, ExternalWrench)]
             every.append(self.momentum.as_sensor())
+        self.residual = residual
         self.method, self._points, self.extras = method, where, dict(extras or {})
         self.problem = HumanDynamics(motion, every, self.noise, (), constraints, hard_dynamics)
         self._weighing = None if self.contacts else weigh(motion, wrenches)
@@ -148,6 +153,7 @@ class HumanDynamicsTask:
             jointed,
             payload,
             self._weighing,
+            self.residual,
             self.extras,
         )
 

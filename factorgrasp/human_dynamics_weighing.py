@@ -31,6 +31,11 @@ class Weighing:
     model: float
 
     @property
+    def nis(self) -> float:
+        """Squared disagreement in units of its variance: 1 is expected, 10 is a wrong model."""
+        return float(((self.mass - self.model) / self.sd) ** 2)
+
+    @property
     def words(self) -> str:
         """A sentence."""
         off = self.mass - self.model
