@@ -209,6 +209,8 @@ def _agreement(result: HumanDynamicsResult) -> Section:
     )
     if result.weighing is not None:
         text += f" By weight: {result.weighing.words}."
+    if result.residual is not None:
+        text += f" {result.residual_words[0].upper()}{result.residual_words[1:]}."
     return Section(
         "Do the sensors agree", text, table=Table(("sensor", "NIS per degree of freedom"), tuple(rows))
     )

@@ -126,6 +126,10 @@ class HumanDynamicsResult:
         if self.residual is not None:
             force, moment = self._residual()
             out["base_residual"] = {"link": self.residual, "force_rms": force, "moment_rms": moment}
+        if self.weighing is not None:
+            w = self.weighing
+            # The mean over a recording shows what no single frame does: to the reader it is one more sensor.
+            out["sensors"].append({"name": "weight", "unit": "kg", "nis_per_dof": w.nis, "words": w.words})
         out["active_constraints"] = sorted({one.meaning for one in frames.active})
         if self.weighing is not None:
             w = self.weighing
@@ -196,13 +200,16 @@ class HumanDynamicsResult:
         if self.weighing is not None:
             lines.append(self.weighing.words)
         if self.residual is not None:
-            force, moment = self._residual()
-            lines.append(
-                f"what motion, masses and forces disagree about acts on {self.residual}: {force:.1f} N, {moment:.1f} Nm RMS"
-            )
+            lines.append(self.residual_words)
         if self.payload is not None:
             lines.append(self.payload.words)
         return "\n".join(lines)
+
+    @property
+    def residual_words(self) -> str:
+        """A sentence on what motion, masses and forces disagree about."""
+        force, moment = self._residual()
+        return f"what motion, masses and forces disagree about acts on {self.residual}: {force:.1f} N, {moment:.1f} Nm RMS"
 
     def _residual(self) -> tuple[float, float]:
         """RMS size of force and moment that the base link carries, N and Nm."""

@@ -33,7 +33,7 @@ class Weighing:
     @property
     def nis(self) -> float:
         """Squared disagreement in units of its variance: 1 is expected, 10 is a wrong model."""
-        return float(((self.mass - self.model) / self.sd) ** 2)
+        return ((self.mass - self.model) / self.sd) ** 2 if self.sd > 0.0 else float("nan")
 
     @property
     def words(self) -> str:
@@ -45,7 +45,7 @@ class Weighing:
                 f"the model is {'too heavy' if off < 0.0 else 'too light'} by {100.0 * abs(off) / self.model:.1f} %, "
                 "or something is held or leant on"
             )
-        return f"the measured forces weigh {self.mass:.2f} kg (sd {self.sd:.2f}), the model {self.model:.2f} kg: {verdict}"
+        return f"the measured forces weigh {self.mass:.2f} kg (sd {self.sd:.2f}), the model {self.model:.2f} kg (NIS {self.nis:.3g}): {verdict}"
 
 
 def weigh(motion: LinkMotion, wrenches: Sequence[ExternalWrench]) -> Weighing | None:

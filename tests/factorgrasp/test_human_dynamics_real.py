@@ -99,9 +99,9 @@ def test_squat_with_plates_by_their_columns(dataset: Find, tmp_path: Path) -> No
         'torque = "ground_force_2_m"\n',
     )
     assert "the model is too heavy by 3.8 %" in output
-    assert "disagrees with the model" in output
     summary = json.loads((tmp_path / "squat" / "estimate.json").read_text(encoding="utf-8"))
-    assert min(sensor["nis_per_dof"] for sensor in summary["sensors"]) > 4.0
+    nis = {sensor["name"]: sensor["nis_per_dof"] for sensor in summary["sensors"]}
+    assert nis["weight"] > 100.0
 
 
 def test_squat_with_a_virtual_payload_in_both_hands(dataset: Find, tmp_path: Path) -> None:

@@ -92,7 +92,7 @@ def test_a_table_of_a_problem_file_names_images(folder: Path) -> None:
         assert not remarks
     with pytest.raises(InputError, match=r"\[blobs\] marker_diametre"):
         blobs_from_table({**table, "marker_diametre": 0.012}, folder, CAMERA)
-    with pytest.raises(InputError, match="either this or colour"):
+    with pytest.raises(InputError, match="one of click, patch and colour"):
         blobs_from_table({**table, "colour": "blue.json", "click": [1.0, 1.0]}, folder, CAMERA)
 
 
