@@ -45,7 +45,8 @@ class Weighing:
                 f"the model is {'too heavy' if off < 0.0 else 'too light'} by {100.0 * abs(off) / self.model:.1f} %, "
                 "or something is held or leant on"
             )
-        return f"the measured forces weigh {self.mass:.2f} kg (sd {self.sd:.2f}), the model {self.model:.2f} kg (NIS {self.nis:.3g}): {verdict}"
+        found = f"the measured forces weigh {self.mass:.2f} kg (sd {self.sd:.2f}), the model {self.model:.2f} kg"
+        return f"{found} (NIS {self.nis:.3g}): {verdict}"
 
 
 def weigh(motion: LinkMotion, wrenches: Sequence[ExternalWrench]) -> Weighing | None:
