@@ -11,22 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from factorgrasp.body_state_prior import jerk_scale, third_difference_band
+from factorgrasp.body_state_prior import jerk_scale
+from factorgrasp.body_state_smoother import CHUNK, normal, smooth_over_time
 from factorgrasp.errors import InputError
 from factorgrasp.problems.body_observations import BodyObservations
 from factorgrasp.problems.observed_osim import Observed, observed
-from factorgrasp.solvers.block_tridiagonal import BlockTridiagonal
 from factorgrasp.typing import BoolArray, FloatArray
 
 POSTURE_SD = 1.0
 """Rad: how far joints are from the zero configuration, for what nothing else tells of."""
-WINDOW = 300
-"""Frames that are smoothed at once, as long as they are four times the overlap: that bounds the memory."""
-OVERLAP = 0.5
-"""s that a window reaches beyond what is kept of it: by then the motion prior has forgotten."""
-WHOLE = 1500
-"""Frames up to which every frame's covariances are kept whole; beyond, that would fill the memory."""
-_CHUNK = 128
 # Information that holds what cannot move.
 _HELD = 1e12
 _KEY = 10
@@ -50,9 +43,9 @@ class BodyState:
     q_variance, qd_variance, qdd_variance : ndarray, shape (n, nv)
         Of every component; those of a free-flyer's translation along the world's axes.
     q_covariance : ndarray, shape (m, nv, nv)
-        Of the first m frames: all of them up to :data:`WHOLE`.
+        Of the first m frames: all of them up to :data:`factorgrasp.body_state_smoother.WHOLE`.
     qdd_covariance : ndarray, shape (n, nv, nv) or (nv, nv)
-        The mean over all frames of a recording longer than :data:`WHOLE`.
+        The mean over all frames of a recording longer than :data:`factorgrasp.body_state_smoother.WHOLE`.
     root_covariance : ndarray, shape (n, 3, 3)
         Of the first three components: a free-flyer's place in the world.
     good : ndarray, shape (n,)
@@ -128,7 +121,7 @@ def estimate_state(
     q = _frame_by_frame(body, observations, rest, pull)
     variance = _information_variance(body, q, pull)
     jerk, _ = jerk_scale(_unrolled(body, q), variance, dt, bandwidth)
-    smooth = _smooth(body, q, rest, pull, jerk, dt)
+    smooth = smooth_over_time(body, q, rest, pull, jerk, dt)
     q, Q = smooth.q, smooth.Q
     v, a = body.derivatives(q, dt)
     good = _told(body, q, pull, variance, round(max_gap / dt))
@@ -197,8 +190,8 @@ def _frame_by_frame(
     keys = np.array(sorted(found))
     nearest = keys[np.abs(np.arange(count)[:, None] - keys).argmin(axis=1)]
     q = q[nearest]
-    for low in range(0, count, _CHUNK):
-        part = slice(low, low + _CHUNK)
+    for low in range(0, count, CHUNK):
+        part = slice(low, low + CHUNK)
         q[part] = _iterate(body, q[part], part, rest, pull, 6)
     return np.asarray(q)
 
@@ -209,7 +202,7 @@ def _first(body: Observed, frame: int, rest: FloatArray, pull: FloatArray) -> Fl
     tried = []
     for start in body.starts(frame, rest):
         q = _iterate(body, start[None], part, rest, pull, _STEPS)
-        tried.append((float(_normal(body, q, part, rest, pull)[2][0]), q))
+        tried.append((float(normal(body, q, part, rest, pull)[2][0]), q))
     q = min(tried, key=lambda one: one[0])[1]
     near = body.nearest(q, rest)
     return np.asarray(_iterate(body, near, part, rest, pull, _STEPS)[0])
@@ -220,7 +213,7 @@ def _iterate(
 ) -> FloatArray:
     """Levenberg-Marquardt on every frame of a stretch, each with a damping of its own."""
     damping = np.full(len(q), 1e-6)
-    H, g, cost = _normal(body, q, part, rest, pull)
+    H, g, cost = normal(body, q, part, rest, pull)
     for _ in range(steps):
         scale = np.einsum("nii->ni", H)
         d = -np.linalg.solve(
@@ -230,7 +223,7 @@ def _iterate(
         # No joint turns by more than a radian at once.
         d *= np.minimum(1.0, 1.0 / np.maximum(np.abs(d).max(axis=1), 1e-12))[:, None]
         tried = body.step(q, d)
-        H2, g2, cost2 = _normal(body, tried, part, rest, pull)
+        H2, g2, cost2 = normal(body, tried, part, rest, pull)
         better = cost2 <= cost * (1.0 + 1e-12)
         q = np.where(better[:, None], tried, q)
         H, g = np.where(better[:, None, None], H2, H), np.where(better[:, None], g2, g)
@@ -240,23 +233,6 @@ def _iterate(
         if done:
             break
     return np.asarray(q)
-
-
-def _normal(
-    body: Observed, q: FloatArray, part: slice, rest: FloatArray, pull: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Information (n, nv, nv), gradient (n, nv) and cost (n,)."""
-    r, J = body.residuals(q, part)
-    JT = np.swapaxes(J, 1, 2)
-    H, g = JT @ J, (JT @ r[..., None])[..., 0]
-    off = body.difference(np.broadcast_to(rest, q.shape), q)
-    beyond, tight = body.limits(q)
-    H[:, np.arange(H.shape[1]), np.arange(H.shape[1])] += pull + tight
-    g += pull * off + tight * beyond
-    cost: FloatArray = 0.5 * (
-        np.sum(r**2, axis=1) + np.sum(pull * off**2, axis=1) + np.sum(tight * beyond**2, axis=1)
-    )
-    return H, g, cost
 
 
 def _information_variance(body: Observed, q: FloatArray, pull: FloatArray) -> FloatArray:
@@ -272,8 +248,8 @@ def _information_variance(body: Observed, q: FloatArray, pull: FloatArray) -> Fl
 def _told(body: Observed, q: FloatArray, pull: FloatArray, usual: FloatArray, most: int) -> BoolArray:
     """Frames of which every component is seen, or was hidden for no more than `most` frames."""
     unseen = np.empty((len(q), usual.size), dtype=bool)
-    for low in range(0, len(q), _CHUNK):
-        part = slice(low, low + _CHUNK)
+    for low in range(0, len(q), CHUNK):
+        part = slice(low, low + CHUNK)
         _, J = body.residuals(q[part], part)
         H = np.swapaxes(J, 1, 2) @ J
         H[:, np.arange(H.shape[1]), np.arange(H.shape[1])] += pull + 1e-6
@@ -292,147 +268,6 @@ def _unrolled(body: Observed, q: FloatArray) -> FloatArray:
     """Coordinates (n, nv) whose differences are those on the manifold."""
     steps = body.difference(q[:-1], q[1:])
     return np.concatenate([np.zeros((1, steps.shape[1])), np.cumsum(steps, axis=0)])
-
-
-# ---- over time --------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class _Smooth:
-    """Configurations, their variances and those of both derivatives, and covariances as far as they are kept."""
-
-    q: FloatArray
-    q2: FloatArray
-    qd2: FloatArray
-    qdd2: FloatArray
-    Q: FloatArray
-    A: FloatArray
-    root: FloatArray
-
-
-def _smooth(
-    body: Observed, q: FloatArray, rest: FloatArray, pull: FloatArray, jerk: FloatArray, dt: float
-) -> _Smooth:
-    count, nv = len(q), body.nv
-    whole = count <= WHOLE
-    overlap = int(np.clip(round(OVERLAP / dt), 30, 120))
-    window = max(WINDOW, 4 * overlap)
-    step = window - 2 * overlap
-    out, root = q.copy(), np.empty((count, min(3, nv), min(3, nv)))
-    q2, qd2, qdd2 = (np.empty((count, nv)) for _ in range(3))
-    Q = np.empty((count if whole else step, nv, nv))
-    A = np.zeros((count, nv, nv) if whole else (nv, nv))
-    for begin in range(0, count, step) if count > window else (0,):
-        low, high = max(0, begin - overlap), min(count, begin + step + overlap)
-        if count <= window:
-            low, high = 0, count
-        part, C, v2, a2 = _smooth_window(body, q[low:high], slice(low, high), rest, pull, jerk, dt)
-        keep = slice(begin, min(count, begin + step) if count > window else count)
-        inside = slice(keep.start - low, keep.stop - low)
-        out[keep], qd2[keep] = part[inside], v2[inside]
-        q2[keep], qdd2[keep] = (np.diagonal(x[inside], axis1=1, axis2=2) for x in (C, a2))
-        root[keep] = C[inside, :3, :3]
-        if keep.stop <= len(Q):
-            Q[keep] = C[inside]
-        if whole:
-            A[keep] = a2[inside]
-        else:
-            A += a2[inside].sum(axis=0) / count
-    return _Smooth(out, q2, qd2, qdd2, Q, A, root)
-
-
-def _smooth_window(
-    body: Observed,
-    q: FloatArray,
-    part: slice,
-    rest: FloatArray,
-    pull: FloatArray,
-    jerk: FloatArray,
-    dt: float,
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Gauss-Newton over all frames of a window.
-
-    Steps of rotations are taken to add up, which they do to first order in the turn of one frame.
-    """
-    count, nv = len(q), body.nv
-    # The posture is known once, not anew in every frame.
-    once = pull / count
-    weight = jerk**-2.0
-    blocks = -(-count // 3)
-    band = third_difference_band(count)
-    system = None
-    for last in (False, False, True):
-        H, g = np.empty((count, nv, nv)), np.empty((count, nv))
-        for low in range(0, count, _CHUNK):
-            some = slice(low, min(low + _CHUNK, count))
-            where = slice(part.start + some.start, part.start + some.stop)
-            H[some], g[some], _ = _normal(body, q[some], where, rest, once)
-        steps = body.difference(q[:-1], q[1:])
-        third = np.diff(steps, n=2, axis=0)
-        pullback = np.zeros((count, nv))
-        for k, c in enumerate((-1.0, 3.0, -3.0, 1.0)):
-            pullback[k : count - 3 + k] += c * weight * third
-        g += pullback
-        system = _assemble(H, band, weight, blocks)
-        if last:
-            break
-        padded = np.zeros((3 * blocks, nv))
-        padded[:count] = -g
-        d = system.solve(padded.reshape(blocks, 3 * nv)).reshape(3 * blocks, nv)[:count]
-        q = body.step(q, d)
-    assert system is not None
-    return (q, *_marginals(system, count, nv, dt))
-
-
-def _assemble(H: FloatArray, band: FloatArray, weight: FloatArray, blocks: int) -> BlockTridiagonal:
-    """Three frames make one block: third differences then reach no further than the next one."""
-    count, nv = H.shape[:2]
-    diagonal = np.zeros((blocks, 3, nv, 3, nv))
-    below = np.zeros((max(blocks - 1, 0), 3, nv, 3, nv))
-    axis = np.arange(nv)
-    for i in range(3 * blocks):
-        b, r = divmod(i, 3)
-        if i >= count:
-            diagonal[b, r, axis, r, axis] = 1.0
-            continue
-        diagonal[b, r, :, r, :] += H[i]
-        for off in range(4):
-            j = i - off
-            if j < 0:
-                continue
-            value = band[off, j] * weight
-            c, s = divmod(j, 3)
-            if c == b:
-                diagonal[b, r, axis, s, axis] += value
-                if off:
-                    diagonal[b, s, axis, r, axis] += value
-            else:
-                below[c, r, axis, s, axis] += value
-    size = 3 * nv
-    return BlockTridiagonal(diagonal.reshape(blocks, size, size), below.reshape(len(below), size, size))
-
-
-def _marginals(
-    system: BlockTridiagonal, count: int, nv: int, dt: float
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Covariances of configurations, variances of velocities and covariances of accelerations."""
-    Z, up = system.inverse_band()
-    Z, up = Z.reshape(-1, 3, nv, 3, nv), up.reshape(-1, 3, nv, 3, nv)
-
-    def block(i: int, j: int) -> FloatArray:
-        """Covariance (nv, nv) between frames i <= j."""
-        (b, r), (c, s) = divmod(i, 3), divmod(j, 3)
-        return np.asarray(Z[b, r, :, s, :] if b == c else up[b, r, :, s, :])
-
-    Q = np.array([block(k, k) for k in range(count)])
-    v2, A = np.empty((count, nv)), np.empty((count, nv, nv))
-    for k in range(count):
-        m = min(max(k, 1), count - 2)
-        last, next_, apart = block(m - 1, m), block(m, m + 1), block(m - 1, m + 1)
-        v2[k] = np.diagonal(Q[m - 1] + Q[m + 1] - 2.0 * apart) / (4.0 * dt**2)
-        mixed = apart - 2.0 * (last + next_)
-        A[k] = (Q[m - 1] + 4.0 * Q[m] + Q[m + 1] + mixed + mixed.T) / dt**4
-    return Q, v2, A
 
 
 def _fit(

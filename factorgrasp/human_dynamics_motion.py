@@ -94,7 +94,8 @@ def read_body_motion(table: Mapping[str, Any], base_dir: Path) -> BodyMotion:
             raise InputError(
                 "[model] base", '"floating", as the body is seen to move in the world', '"fixed"'
             )
-        from factorgrasp.human_dynamics_markers import from_observations, state_noise
+        from factorgrasp.human_dynamics_markers import from_observations
+        from factorgrasp.human_dynamics_state_noise import state_noise
 
         state, variances = from_observations(pin_model, body, motion, file, base_dir, gravity)
         tree = PinocchioTree(pin_model, gravity=gravity)

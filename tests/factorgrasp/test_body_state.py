@@ -363,11 +363,11 @@ def test_long_recordings_keep_means(
     walking: HumanRecording, seen: BodyObservations, state: BodyState, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Windows and means of covariances give what the whole gives, where both exist."""
-    from factorgrasp import body_state
+    from factorgrasp import body_state_smoother
 
     model, t, part = walking.body.model(), walking.t[FRAMES], seen
     for name, value in (("WINDOW", 150), ("OVERLAP", 0.375), ("WHOLE", 100)):
-        monkeypatch.setattr(body_state, name, value)
+        monkeypatch.setattr(body_state_smoother, name, value)
     pieces = estimate_state(model, t, part)
     assert pieces.qdd_covariance.shape == (model.nv, model.nv)
     assert pieces.q_covariance.shape == (76, model.nv, model.nv)
