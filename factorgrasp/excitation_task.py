@@ -178,8 +178,9 @@ def _blind(problem: Excitation) -> str:
     s = problem.settings
     if s.axes != "travel" or s.alpha is None:
         return ""
-    directions = np.unique(np.round(problem.human.axis(np.linspace(0.0, s.duration, 101)[1:-1]).T, 6), axis=0)
-    if len(directions) > 1:
+    times = np.linspace(0.0, s.duration, 101)[1:-1]
+    directions = problem.human.axis(times).T
+    if np.linalg.matrix_rank(directions, tol=0.02) > 1 or np.ptp(problem.human.turn(times)) > 1e-3:
         return ""
     return (
         f"turning about one direction of travel ({', '.join(f'{x:.2g}' for x in directions[0])}) alone never shows the lever arm along "
