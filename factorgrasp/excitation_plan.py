@@ -210,18 +210,22 @@ class ExcitationPlan:
 
     def save(self, directory: str | Path) -> Path:
         """Write ``trajectory.csv``, ``estimate.npz`` and ``estimate.json`` into `directory`, each atomically; returns the JSON's path."""
+        from factorgrasp.excitation_exports import write_exports
         from factorgrasp.results import write_result
 
         folder, columns = Path(directory), self.table()
         with replacing(folder / TRAJECTORY_NAME) as temporary:
             data = np.column_stack(list(columns.values()))
             np.savetxt(temporary, data, "%.9g", ",", header=",".join(columns), comments="", encoding="utf-8")
+        write_exports(self, folder)
         return write_result(folder, self.to_dict(), self.arrays())
 
     @property
     def extra_files(self) -> tuple[str, ...]:
         """Names of what :meth:`save` writes beside the usual two."""
-        return (TRAJECTORY_NAME,)
+        from factorgrasp.excitation_exports import export_names
+
+        return (TRAJECTORY_NAME, *export_names(self))
 
     def summary(self) -> str:
         """A few lines for a terminal."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import pytest
 from factorgrasp import plots
 from factorgrasp.errors import InputError
 from factorgrasp.excitation_plots import draw_margins, draw_wrench
+from factorgrasp.joint_trajectory import JointTrajectory
 from factorgrasp.models.arm import seven_axis_arm
 from factorgrasp.motion_scene import MotionScene, animate, save_rrd, strip
 from factorgrasp.simulation.cehajic2015_loop import cehajic2015_loop
@@ -69,3 +71,24 @@ def test_springs_of_the_printed_motion() -> None:
     off = error - axis * (axis @ error)
     peak, _ = spring_force((0.5, 0.0, 0.0), 150.0)
     assert peak == pytest.approx(150.0 * 2.0 * np.sin(0.5 * turn) * np.linalg.norm(off), rel=1e-3)
+
+
+def test_planner_s_arm_and_ours_are_written_alike(tmp_path: Path) -> None:
+    """The trajectory of a plan in joint space, as a ROS message and as pictures."""
+    exports = pytest.importorskip("factorgrasp.excitation_exports")
+    arm = seven_axis_arm()
+    t = np.arange(0.0, 1.0, 0.01)
+    q = arm.start + 0.05 * np.sin(t)[:, None]
+    robot = SimpleNamespace(model=arm.model)
+    problem = SimpleNamespace(
+        arm=SimpleNamespace(robot=robot, frame="grasp"), grasp=SimpleNamespace(translation=LEVER)
+    )
+    zero = np.zeros_like(q)
+    plan = SimpleNamespace(
+        t=t, q=q, qd=zero, qdd=zero, tau=zero, wrench=np.zeros((t.size, 6)), problem=problem
+    )
+    exports.write_exports(plan, tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == set(exports.export_names(plan))
+    back = JointTrajectory.load(tmp_path / "joint_trajectory.yaml")
+    assert back.names == tuple(f"joint{k}" for k in range(1, 8))
+    np.testing.assert_array_equal(back.positions[-1], q[-1])
