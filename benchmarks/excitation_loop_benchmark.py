@@ -112,11 +112,15 @@ def closed_loop(seeds: int) -> list[Metric]:
             "deg",
         )
     )
+    group = "receding, clocks unknown"
+    lever = 1e3 * max(r.translation_error[-1] for r in clock)
+    turn = float(np.degrees(max(r.rotation_error[-1] for r in clock)))
+    force = max(r.felt().peak_force for r in clock)
     rows += [
-        Metric("receding, clocks unknown/lever arm error, worst seed", 1e3 * max(r.translation_error[-1] for r in clock), "mm", note=f"{FEW} seeds"),
-        Metric("receding, clocks unknown/orientation error, worst seed", float(np.degrees(max(r.rotation_error[-1] for r in clock))), "deg"),
-        Metric("receding, clocks unknown/peak force, worst seed", max(r.felt().peak_force for r in clock), "N"),
-    ]  # fmt: skip
+        Metric(f"{group}/lever arm error, worst seed", lever, "mm", note=f"{FEW} seeds"),
+        Metric(f"{group}/orientation error, worst seed", turn, "deg"),
+        Metric(f"{group}/peak force, worst seed", force, "N"),
+    ]
     ratio = [a.felt().peak_force / b.felt().peak_force for a, b in zip(theirs, ours, strict=True)]
     rows.append(Metric("peak force, paper over receding, least seed", min(ratio), "", "higher", 10.0))
     return rows

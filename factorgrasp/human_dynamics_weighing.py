@@ -45,7 +45,9 @@ class Weighing:
                 f"the model is {'too heavy' if off < 0.0 else 'too light'} by {100.0 * abs(off) / self.model:.1f} %, "
                 "or something is held or leant on"
             )
-        found = f"the measured forces weigh {self.mass:.2f} kg (sd {self.sd:.2f}), the model {self.model:.2f} kg"
+        found = (
+            f"the measured forces weigh {self.mass:.2f} kg (sd {self.sd:.2f}), the model {self.model:.2f} kg"
+        )
         return f"{found} (NIS {self.nis:.3g}): {verdict}"
 
 
