@@ -156,7 +156,7 @@ def _objective(problem: Excitation, space: PlanSpace, C: FloatArray) -> float:
 
 def _words(problem: Excitation, result: ExchangeResult) -> str:
     if result.status.ok:
-        return ""
+        return f"every limit and window holds; {result.message}" if result.message else ""
     s = problem.settings
     asked = f"alpha = {s.alpha:g} rad^2/s^3" if s.alpha is not None else "the target sd"
     limits = [word for word in result.binding if not word.startswith("excitation between")]

@@ -30,6 +30,8 @@ PANELS = 6
 """Panels of the quadrature per period of the bandwidth, two Gauss points each."""
 TIGHTER = 1e-3
 """Share of a limit that is kept free at the instants at which it is imposed, so that it holds between them."""
+DENSE = 16
+"""Instants per period of the bandwidth at which a coordinate's limit is imposed once it was violated anywhere."""
 TOLERANCE = 1e-6
 """Violation, relative to a limit's range, below which it counts as rounding."""
 
@@ -338,6 +340,9 @@ class Excitation:
                 t, value, bound.lower, bound.upper, bound.scale, bound.name, bound.unit, False
             )
             margins.append(margin)
+            if worst:
+                # These rows are linear: the whole of a limit that binds costs less than the rounds in which its instants move about.
+                coordinates |= {(index, float(time)) for time in self._dense}
             coordinates |= {(index, float(t[k])) for k in worst}
         if space.path is not None:
             h = space.path.values(z, given)
@@ -367,6 +372,12 @@ class Excitation:
             shares,
             Points(frozenset(coordinates), frozenset(path), frozenset(windows), tighter),
         )
+
+    @cached_property
+    def _dense(self) -> FloatArray:
+        """Instants between which a motion of the bandwidth cannot exceed a limit by much, s."""
+        s = self.settings
+        return np.linspace(0.0, s.duration, 1 + int(np.ceil(DENSE * s.duration * s.bandwidth)))
 
     def near_pairs(self, C: FloatArray) -> tuple[tuple[int, int, str], ...]:
         """Of the arm's other pairs, those that a plan in joint space brings nearer than allowed anywhere on the grid."""
