@@ -48,6 +48,7 @@ time_offset = true
 _EPILOG = (
     "A problem file (TOML; SI units, rad, quaternions w first; paths relative to the file):\n\n"
     + EXAMPLE.replace("[", "\\[")
+    + '\nOther kinds: "human_dynamics", "wrist_pose", "excitation"; docs/problem-files.md names every key.\n'
     + "\nExit codes: 0 solved, 1 not solved (the reason is printed and written), 2 bad input."
 )
 

@@ -32,7 +32,7 @@ _DENSITY_WEIGHT = 3.0
 _DENSITY_BOUNDS = (0.1, 100.0)
 NOT_RIGID = 70.0
 """Squared deviation of the learnt layout in its own covariance: of 18 coordinates, less than one in a million rigid palms."""
-_DECISIVE_FRAMES = 8
+_DECISIVE_FRAMES = 30
 """Frames in a row that have to decide between two poses before one of them is believed without reserve."""
 
 
