@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import fields
-from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
 
@@ -29,9 +27,6 @@ from factorgrasp.toml_tables import check_keys, from_table, get, place, sub_tabl
 from factorgrasp.typing import FloatArray
 
 TABLES = ("robot", "grasp", "human", "excitation", "noise", "solver", "evaluate")
-EVALUATION = "factorgrasp.excitation_evaluate"
-"""Module whose ``build_evaluation(table, base_dir)`` takes files with an [evaluate] table: the excitation of a trajectory that is given."""
-
 Three = tuple[float, float, float]
 Four = tuple[float, float, float, float]
 Numbers = float | tuple[float, ...]
@@ -51,11 +46,9 @@ def build(table: Mapping[str, Any], base_dir: Path) -> Any:
         Naming the table and the key.
     """
     if "evaluate" in table:
-        if find_spec(EVALUATION) is None:
-            raise InputError(
-                "[evaluate]", "a file that asks for a plan ([excitation])", "a trajectory to evaluate"
-            )
-        return import_module(EVALUATION).build_evaluation(table, base_dir)
+        from factorgrasp.excitation_evaluate import build_evaluation
+
+        return build_evaluation(table, base_dir)
     check_keys(table, TABLES, "")
     settings = from_table(ExcitationSettings, sub_table(table, "excitation", required=True), "[excitation]")
     grasp = read_grasp(sub_table(table, "grasp", required=True), base_dir)

@@ -22,7 +22,7 @@ from factorgrasp.problems.wrist_estimate import (
     lost_frames,
     make_track,
 )
-from factorgrasp.problems.wrist_pose import WristPose, track_forward
+from factorgrasp.problems.wrist_pose import WristPose
 from factorgrasp.problems.wrist_settings import WristAssociation, WristNoise, WristSettings
 from factorgrasp.problems.wrist_track import CameraPose, WristTrack
 from factorgrasp.provenance import versions
@@ -157,18 +157,8 @@ class WristTask:
         """The track as an online estimator gives it, newest or lagged."""
         problem = self.problem
         started = time.perf_counter()
-        first, newest = track_forward(
-            problem.camera,
-            problem.blobs,
-            problem.markers,
-            problem.association,
-            problem.noise,
-            problem.settings,
-        )
+        first, newest = problem.forward
         elapsed = time.perf_counter() - started
-        problem.__dict__["first_pass"] = first
-        if not any(node.used for node in first.nodes):
-            raise NotSolvedError(problem._why_nothing())
         nodes = first.nodes if self.method == "fixed_lag" else newest
         used = np.array([node.used for node in newest])
         gaps = find_gaps(problem.blobs.t, used, problem.association.lost_after)

@@ -138,8 +138,8 @@ class WristPose:
     # ---- the first pass
 
     @cached_property
-    def first_pass(self) -> FirstPass:
-        """Tracked frame by frame; done once, when it is first needed.
+    def forward(self) -> tuple[FirstPass, tuple[Node, ...]]:
+        """Tracked frame by frame, once, when it is first needed: what came out, and the newest (filtered) node of every frame.
 
         Raises
         ------
@@ -147,12 +147,17 @@ class WristPose:
             When the hand is found in no frame, with the reason.
         """
         self.blobs.check_camera(self.camera)
-        first, _ = track_forward(
+        first, newest = track_forward(
             self.camera, self.blobs, self.markers, self.association, self.noise, self.settings
         )
         if not any(node.used for node in first.nodes):
             raise NotSolvedError(self._why_nothing())
-        return first
+        return first, newest
+
+    @property
+    def first_pass(self) -> FirstPass:
+        """The lagged nodes, associations and rates of :attr:`forward`."""
+        return self.forward[0]
 
     def _why_nothing(self) -> str:
         counts = self.blobs.counts

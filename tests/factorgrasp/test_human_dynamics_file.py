@@ -306,12 +306,7 @@ def test_walking_by_default_leaves_the_disagreement_to_the_base(
 
 @pytest.mark.parametrize(("value", "found"), [("-1.0", "above zero"), ("[1.0, 2.0]", "base_residual")])
 def test_a_base_residual_is_a_variance(changed: Callable[..., Path], value: str, found: str) -> None:
-    path = changed()
-    text = path.read_text(encoding="utf-8")
-    text = text.replace("[covariance]", f"[covariance]\nbase_residual = {value}") if "[covariance]" in text else (
-        f"{text}\n[covariance]\nbase_residual = {value}\n"
-    )  # fmt: skip
-    path.write_text(text, encoding="utf-8")
+    path = changed(("[covariance]", f"[covariance]\nbase_residual = {value}"))
     with pytest.raises(InputError, match=found):
         load_problem(path)
 

@@ -10,6 +10,7 @@ import pytest
 
 from factorgrasp import plots
 from factorgrasp.errors import InputError
+from factorgrasp.excitation_exports import export_names, write_exports
 from factorgrasp.excitation_plots import draw_margins, draw_wrench
 from factorgrasp.joint_trajectory import JointTrajectory
 from factorgrasp.models.arm import seven_axis_arm
@@ -75,7 +76,6 @@ def test_springs_of_the_printed_motion() -> None:
 
 def test_planner_s_arm_and_ours_are_written_alike(tmp_path: Path) -> None:
     """The trajectory of a plan in joint space, as a ROS message and as pictures."""
-    exports = pytest.importorskip("factorgrasp.excitation_exports")
     arm = seven_axis_arm()
     t = np.arange(0.0, 1.0, 0.01)
     q = arm.start + 0.05 * np.sin(t)[:, None]
@@ -87,8 +87,8 @@ def test_planner_s_arm_and_ours_are_written_alike(tmp_path: Path) -> None:
     plan = SimpleNamespace(
         t=t, q=q, qd=zero, qdd=zero, tau=zero, wrench=np.zeros((t.size, 6)), problem=problem
     )
-    exports.write_exports(plan, tmp_path)
-    assert {path.name for path in tmp_path.iterdir()} == set(exports.export_names(plan))
+    write_exports(plan, tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == set(export_names(plan))
     back = JointTrajectory.load(tmp_path / "joint_trajectory.yaml")
     assert back.names == tuple(f"joint{k}" for k in range(1, 8))
     np.testing.assert_array_equal(back.positions[-1], q[-1])
